@@ -1,0 +1,99 @@
+# ct2lut: `make help` lists what there is to type.
+#
+# Make decides nothing about freshness: every result is checked by content, in `ct2lut` and in tools/setup.sh.
+
+# What a user types is data. `override NAME := $(value NAME)` stops make from expanding it, an empty MAKEOVERRIDES stops
+# make from expanding it again on its way into the environment of a recipe, and recipes read it there, in double quotes.
+CASES ?= cases
+RESULTS ?= results
+PROTOCOL ?= clinical
+JOBS ?= 0
+override ID := $(value ID)
+override CASES := $(value CASES)
+override RESULTS := $(value RESULTS)
+override PROTOCOL := $(value PROTOCOL)
+override JOBS := $(value JOBS)
+override SET := $(value SET)
+export ID CASES RESULTS PROTOCOL JOBS SET
+MAKEOVERRIDES =
+
+# The interpreter that makes the virtual environment; everything else runs inside it.
+PYTHON ?= python3
+export PYTHON
+
+SHELL := /bin/sh
+BIN := .venv/bin
+UV_COMPILE := $(BIN)/uv pip compile pyproject.toml --group build --universal --python-version 3.11 \
+	--generate-hashes --no-header --no-annotate --quiet
+
+# The words of SET as --set options: split at blanks, never expanded as file name patterns.
+OPTIONS = set -f; set --; for pair in $$SET; do set -- "$$@" --set "$$pair"; done; \
+	set -- "$$@" --cases "$$CASES" --results "$$RESULTS" --protocol "$$PROTOCOL"
+NEED_ID = if [ -z "$$ID" ]; then echo "Which case? Type: make $@ ID=P001" >&2; exit 20; fi
+
+.DEFAULT_GOAL := help
+.PHONY: help setup setup-dev demo demo-real patient plan status report verify test lint format bench validate docs lock clean
+
+help:  ## show this list
+	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | \
+		while IFS='|' read -r target text; do printf '%-18s %s\n' "$$target" "$$text"; done
+	@echo
+	@echo '  make patient ID=P001 [CASES=cases] [RESULTS=results] [PROTOCOL=clinical] [JOBS=n] [SET="stage.key=value ..."]'
+
+setup:  ## install everything into .venv (once; checks in a moment that nothing is missing)
+	@tools/setup.sh run
+
+setup-dev:
+	@tools/setup.sh dev
+
+demo: setup  ## make a knee, process it, show where the report is
+	@[ -d build/demo/cases/demo ] || $(BIN)/ct2lut phantom build/demo/cases --id demo
+	@$(BIN)/ct2lut run demo --cases build/demo/cases --results build/demo/results --protocol demo
+
+demo-real: setup  ## the same with a real knee, segmented from MR (fetches 90 MB the first time)
+	@$(BIN)/python -P tools/fetch_real_knee.py build/demo-real/cases/knee
+	@$(BIN)/ct2lut run knee --cases build/demo-real/cases --results build/demo-real/results --protocol clinical
+
+patient: setup  ## process one case: make patient ID=P001
+	@$(NEED_ID); $(OPTIONS); $(BIN)/ct2lut run "$$@" --jobs "$$JOBS" -- "$$ID"
+
+plan: setup  ## say which stages of a case would run, and why: make plan ID=P001
+	@$(NEED_ID); $(OPTIONS); $(BIN)/ct2lut plan "$$@" -- "$$ID"
+
+status: setup  ## how far one case (ID=P001) or every case has got
+	@set --; if [ -n "$$ID" ]; then set -- -- "$$ID"; fi; $(BIN)/ct2lut status --results "$$RESULTS" "$$@"
+
+report: setup  ## bring the report of a case up to date and say where it is: make report ID=P001
+	@$(NEED_ID); $(OPTIONS); $(BIN)/ct2lut report "$$@" --jobs "$$JOBS" -- "$$ID"
+
+verify: setup  ## compare the results of a case with their recorded checksums: make verify ID=P001
+	@$(NEED_ID); $(BIN)/ct2lut verify --results "$$RESULTS" -- "$$ID"
+
+test: setup-dev  ## run the tests
+	@$(BIN)/python -P -m pytest
+
+lint: setup-dev  ## check style and types
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+
+format: setup-dev  ## mend what `make lint` can mend by itself
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+bench: setup-dev  ## measure speed
+	@$(BIN)/python -m tests.bench
+
+validate: setup-dev  ## compare with closed forms, the paper's test objects and published data
+	@$(BIN)/python -m tests.validate
+
+docs: setup-dev  ## write docs/commands.md, docs/settings.md and docs/messages.md from the code
+	@$(BIN)/python -m tools.reference docs
+
+lock: setup-dev  ## resolve the versions of every dependency again
+	@$(UV_COMPILE) --upgrade --output-file requirements.lock
+	@$(UV_COMPILE) --extra dev --constraint requirements.lock --output-file requirements-dev.lock
+
+clean:  ## remove the virtual environment, caches and demos; never cases or results
+	@rm -rf .venv build .pytest_cache .ruff_cache .mypy_cache ct2lut.egg-info
+	@find pipeline tests tools -name __pycache__ -prune -exec rm -rf {} +

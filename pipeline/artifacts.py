@@ -1,0 +1,39 @@
+"""Every artifact of the flow, in order: what stages leave for one another on disk."""
+
+from __future__ import annotations
+
+from pipeline.engine.artifacts import folder
+from pipeline.engine.records import record_artifact
+from pipeline.files.arrays import array_artifact, label_volume_artifact, mesh_artifact, mesh_set_artifact
+from pipeline.kinematics.table import RawTable, SmoothTable
+from pipeline.records import Anatomy, CaseFacts, MeshQuality, SurfaceOrigin, Verdict
+
+# 10_intake
+CASE_FACTS = record_artifact("case_facts", "case.json", CaseFacts)
+LABELS = label_volume_artifact("labels", "labels.nrrd")  # None where the case brought meshes
+GIVEN_MESHES = mesh_set_artifact("given_meshes", "given_meshes.npz")  # empty where the case brought labels
+
+# 30_mesh
+MESHES = mesh_set_artifact("meshes", "meshes.npz")
+MESH_QUALITY = record_artifact("mesh_quality", "mesh_quality.json", tuple[MeshQuality, ...])
+
+# 40_anatomy
+ANATOMY = record_artifact("anatomy", "anatomy.json", Anatomy)
+
+# 50_contact
+REFERENCE_BODY = mesh_artifact("reference_body", "reference_body.npz")
+MOVING_BODY = mesh_artifact("moving_body", "moving_body.npz")
+SURFACE_ORIGINS = record_artifact("surface_origins", "surface_origins.json", tuple[SurfaceOrigin, ...])
+
+# 60_sweep
+RAW_TABLE = array_artifact("raw_table", "raw_table.npz", RawTable)
+
+# 70_smooth
+SMOOTH_TABLE = array_artifact("smooth_table", "smooth_table.npz", SmoothTable)
+
+# 80_qa
+VERDICT = record_artifact("verdict", "verdict.json", Verdict)
+REPORT = folder("report", "report/")  # report.html and images/*.png
+
+# 90_package
+PACKAGE = folder("package", "./")  # the deliverable itself: lut.h5, lut.csv, meshes/ ...

@@ -1,0 +1,277 @@
+"""The command line: the only place that prints or exits.
+
+Heavy libraries are imported inside the commands that need them, so that help and a run with nothing to do are quick.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from pipeline import __version__
+from pipeline.case_id import check_case_id, is_case_id
+from pipeline.errors import ConfigError, ExitCode, PipelineError
+
+if TYPE_CHECKING:
+    from pipeline.engine.stage import Stage
+    from pipeline.request import Request
+
+EXIT_CODES = """Exit codes: 0 PASS, 10 REJECTED (the case cannot be used), 11 REVIEW (look before you use it),
+20 wrong settings or usage, 30 the machine (disk, permission, renderer), 70 an error in the program, 130 interrupted."""
+
+app = typer.Typer(
+    name="ct2lut",
+    help="From the label map of a knee to the look-up table that animates it. Research use - not for diagnosis.",
+    epilog=EXIT_CODES,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+CaseId = Annotated[str, typer.Argument(metavar="ID", help="The case: the name of its folder below --cases.")]
+Cases = Annotated[Path, typer.Option("--cases", help="Folder with one folder a case; never written to.")]
+Results = Annotated[Path, typer.Option("--results", help="Folder for the results, one folder a case.")]
+Protocol = Annotated[str, typer.Option("--protocol", help="Name of a protocol, or a .yaml file of your own.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="STAGE.KEY=VALUE", help="Change one setting; may be given several times."),
+]
+Jobs = Annotated[int, typer.Option("--jobs", min=0, help="Processes to use; 0 means one for each core.")]
+
+DEFAULT_CASES = Path("cases")
+DEFAULT_RESULTS = Path("results")
+DEFAULT_PROTOCOL = "clinical"
+
+
+def main() -> None:
+    """Entry point of the program ``ct2lut``."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    sys.exit(execute(sys.argv[1:]))
+
+
+def execute(arguments: Sequence[str]) -> int:
+    """Run one command; the exit code is returned and every failure is two lines on standard error."""
+    try:
+        code = app(list(arguments) or ["--help"], prog_name="ct2lut", standalone_mode=False) or 0
+    except PipelineError as error:
+        return _complain(f"{error.code}  {error.problem}", error.action, error.exit_code)
+    except typer.TyperException as error:
+        return _complain(f"E-USE-01  {error.format_message()}", "ct2lut --help lists the commands.", ExitCode.USAGE)
+    except Exception as error:  # noqa: BLE001 -- the last line of defence: a bug is told in one line
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        problem = f"E-BUG-01  The program failed: {type(error).__name__} in {place.name}, line {place.lineno}."
+        return _complain(problem, "Please report this line and the command you typed.", ExitCode.ERROR)
+    if code == ExitCode.INTERRUPTED:
+        return _complain("Interrupted.", "The same command goes on where this one stopped.", ExitCode.INTERRUPTED)
+    return int(code)
+
+
+@app.callback(invoke_without_command=True)
+def _program(
+    version: Annotated[bool, typer.Option("--version", help="Show the version and stop.")] = False,
+) -> None:
+    if version:
+        print(f"ct2lut {__version__}")
+        raise typer.Exit
+
+
+@app.command()
+def run(
+    case_id: CaseId,
+    cases: Cases = DEFAULT_CASES,
+    results: Results = DEFAULT_RESULTS,
+    protocol: Protocol = DEFAULT_PROTOCOL,
+    overrides: Overrides = None,
+    jobs: Jobs = 0,
+) -> int:
+    """Process one case, from its label map to the packaged table.
+
+    What is up to date is not computed again.
+
+    Example: ct2lut run P001 --cases cases --results results --set sweep.flexion_step_deg=2
+    """
+    return _run(_request(case_id, cases, results, protocol, overrides), jobs, _flow())
+
+
+@app.command()
+def plan(
+    case_id: CaseId,
+    cases: Cases = DEFAULT_CASES,
+    results: Results = DEFAULT_RESULTS,
+    protocol: Protocol = DEFAULT_PROTOCOL,
+    overrides: Overrides = None,
+) -> None:
+    """Say which stages would run, and why.
+
+    Nothing is computed and nothing is written.
+
+    Example: ct2lut plan P001 --set smooth.flexion_degree=8
+    """
+    from pipeline.engine.runner import plan_case
+    from pipeline.summary import plan_lines
+
+    request = _request(case_id, cases, results, protocol, overrides)
+    flow = _flow()
+    _say(*plan_lines(plan_case(request.job(), flow, request.settings(flow))))
+
+
+@app.command()
+def status(
+    case_id: Annotated[str | None, typer.Argument(metavar="[ID]", help="One case; without it, all of them.")] = None,
+    results: Results = DEFAULT_RESULTS,
+) -> None:
+    """Show how far a case has got.
+
+    With ID one line for each stage, without it one line for each case.
+
+    Example: ct2lut status P001
+    """
+    from pipeline.engine.runner import read_status
+    from pipeline.summary import overview_line, status_lines
+
+    flow = _flow()
+    if case_id is not None:
+        _say(*status_lines(read_status(results / check_case_id(case_id), flow)))
+        return
+    folders = sorted(path for path in results.iterdir() if path.is_dir()) if results.is_dir() else []
+    _say(*(overview_line(path.name, read_status(path, flow)) for path in folders if is_case_id(path.name)))
+    if not folders:
+        _say(f"no results in {results}")
+
+
+@app.command()
+def report(
+    case_id: CaseId,
+    cases: Cases = DEFAULT_CASES,
+    results: Results = DEFAULT_RESULTS,
+    protocol: Protocol = DEFAULT_PROTOCOL,
+    overrides: Overrides = None,
+    jobs: Jobs = 0,
+) -> int:
+    """Bring the report up to date and say where it is.
+
+    Only what the report needs and what is out of date is computed.
+
+    Example: ct2lut report P001
+    """
+    flow = _flow()
+    upto = next(index for index, stage in enumerate(flow, 1) if any(a.name == "report" for a in stage.writes))
+    return _run(_request(case_id, cases, results, protocol, overrides), jobs, flow[:upto])
+
+
+@app.command()
+def verify(case_id: CaseId, results: Results = DEFAULT_RESULTS) -> int:
+    """Compare results with their checksums.
+
+    Example: ct2lut verify P001
+    """
+    from pipeline.engine.runner import verify_case
+
+    problems = verify_case(results / check_case_id(case_id), _flow())
+    _say(*(problems or (f"{case_id}: every recorded file is as it was written",)))
+    return ExitCode.ENVIRONMENT if problems else ExitCode.PASS
+
+
+@app.command()
+def lookup(
+    case_id: CaseId,
+    flexion: Annotated[float, typer.Option("--flexion", help="Flexion in degrees.")],
+    varus: Annotated[float, typer.Option("--varus", help="Varus in degrees; negative is valgus.")] = 0.0,
+    results: Results = DEFAULT_RESULTS,
+    clamp: Annotated[bool, typer.Option("--clamp", help="Outside the table, take its nearest pose.")] = False,
+) -> None:
+    """Print the stable pose at a flexion and varus.
+
+    Six coordinates, and the 4x4 matrix that moves the moving bone from where it was scanned (LPS, mm).
+
+    Example: ct2lut lookup P001 --flexion 45 --varus 2
+    """
+    from pipeline.playback import Lut
+    from pipeline.summary import pose_lines
+
+    path = results / check_case_id(case_id) / "90_package" / "lut.h5"
+    if not path.is_file():
+        problem = f"{case_id} has no finished table yet."
+        raise ConfigError("E-LUT-01", problem, f"Run it first: ct2lut run {case_id}.")
+    try:
+        table = Lut.open(path)
+        outside: Literal["clamp", "raise"] = "clamp" if clamp else "raise"
+        pose, motion = table.coordinates(flexion, varus, outside), table.pose(flexion, varus, outside)
+    except ValueError as error:
+        raise ConfigError("E-LUT-02", f"{error}.", "Ask for another attitude, or add --clamp.") from error
+    _say(*pose_lines(pose._asdict(), motion.tolist()))
+
+
+@app.command()
+def phantom(
+    folder: Annotated[Path, typer.Argument(metavar="CASES", help="Folder with one folder a case.")],
+    case_id: Annotated[str, typer.Option("--id", help="Name of the new case.")] = "phantom",
+    numbers: Annotated[
+        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change one number of the knee or the scan.")
+    ] = None,
+) -> None:
+    """Make a knee to try the program with.
+
+    Its anatomy is known exactly, so results can be checked.
+
+    Example: ct2lut phantom cases --id demo --set side=left --set spacing_mm=[1,1,1]
+    """
+    from pipeline.request import phantom_spec
+
+    place = folder / check_case_id(case_id)
+    if place.exists():
+        raise ConfigError("E-PHA-01", f"The case {case_id} is there already.", "Choose another --id, or remove it.")
+    spec = phantom_spec(numbers or ())
+    from pipeline.files.phantom_case import write_phantom_case
+
+    write_phantom_case(place, spec)
+    _say(f"made the case {place}")
+
+
+def _request(case_id: str, cases: Path, results: Path, protocol: str, overrides: Sequence[str] | None) -> Request:
+    from pipeline.request import Request
+
+    return Request(case_id, cases, results, protocol, tuple(overrides or ()))
+
+
+def _flow() -> tuple[Stage, ...]:
+    """The stages, imported when a command needs them; a test gives others."""
+    from pipeline.flow import FLOW
+
+    return FLOW
+
+
+def _run(request: Request, jobs: int, flow: Sequence[Stage]) -> int:
+    from pipeline.engine.console import console_listener
+    from pipeline.engine.runner import Execution, run_case
+    from pipeline.summary import closing, header, report_page
+
+    settings = request.settings(_flow())
+    _say(header(request.case_id, request.protocol, settings))
+    listener = console_listener(_write, terminal=sys.stdout.isatty())
+    execution = Execution(jobs or len(os.sched_getaffinity(0)))
+    outcome = run_case(request.job(), flow, settings, execution, listener)
+    _say(*closing(outcome, report_page(request.job().results, flow)))
+    return outcome.exit_code
+
+
+def _say(*lines: str) -> None:
+    for line in lines:
+        _write(f"{line}\n")
+
+
+def _write(text: str) -> None:
+    print(text, end="", flush=True)
+
+
+def _complain(problem: str, action: str, code: ExitCode) -> int:
+    print(f"{problem}\n{action}", file=sys.stderr)
+    return code

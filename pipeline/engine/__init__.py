@@ -1,0 +1,1 @@
+"""Runs any list of stages over cases; knows nothing of knees."""

@@ -1,0 +1,100 @@
+"""One run of a case at a time. The lock saves work; correctness rests on atomic commits, not on it."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+
+from pipeline.engine.storage_faults import storage
+from pipeline.engine.store import make_folder, open_or_create
+from pipeline.errors import EnvironmentFault
+
+LOCK_FILE = ".lock"
+
+_NO_LOCKS_HERE = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL})
+_held: set[int] = set()
+
+
+def _release_in_child() -> None:
+    # A forked worker that outlives its parent must not keep the case locked.
+    for descriptor in _held:
+        os.close(descriptor)
+    _held.clear()
+
+
+os.register_at_fork(after_in_child=_release_in_child)
+
+
+@contextmanager
+def case_lock(root: Path) -> Iterator[bool]:
+    """Hold the lock of a case's results folder, which is made if it is not there.
+
+    The lock is the kernel's (flock), so a killed run never leaves it behind; the file stays and says who holds it.
+
+    Yields
+    ------
+    bool
+        False where the file system has no locks: another run may be at work on the same case.
+
+    Raises
+    ------
+    EnvironmentFault
+        ``E-LOCK-01`` at once when another run holds it; other codes when the folder cannot be used.
+    """
+    with storage(f"Opening the results folder {root.name}"):
+        make_folder(root)
+        descriptor = open_or_create(root / LOCK_FILE, os.O_RDWR)
+    _held.add(descriptor)
+    try:
+        with storage(f"Locking the results folder {root.name}"):
+            locked = _acquire(descriptor, root.name)
+        yield locked
+    finally:
+        _held.discard(descriptor)
+        os.close(descriptor)
+
+
+def is_running(root: Path) -> bool:
+    """Whether some run holds the lock of a case's results folder; changes nothing."""
+    try:
+        descriptor = os.open(root / LOCK_FILE, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def _acquire(descriptor: int, case_id: str) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise _busy(descriptor, case_id) from error
+    except OSError as error:
+        if error.errno in _NO_LOCKS_HERE:
+            return False
+        raise
+    started = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    os.ftruncate(descriptor, 0)
+    os.pwrite(descriptor, f"since {started} (pid {os.getpid()})\n".encode(), 0)
+    return True
+
+
+def _busy(descriptor: int, case_id: str) -> EnvironmentFault:
+    holder = os.pread(descriptor, 100, 0).decode("ascii", "replace").strip()
+    return EnvironmentFault(
+        "E-LOCK-01",
+        f"Case {case_id} is already running {holder or 'since a moment ago'}.",
+        "Wait until that run ends, or stop it; nothing was changed.",
+    )

@@ -1,0 +1,102 @@
+"""Which files of a case folder are read, and their bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+
+from pipeline.engine.artifacts import SourceFolder
+from pipeline.errors import CaseRejected
+from pipeline.files.markups import MARKUP_ENDINGS
+from pipeline.files.meshes import MESH_ENDINGS
+from pipeline.files.volumes import DETACHED_ENDINGS, LABEL_MAP_ENDINGS
+
+#: A larger file is not read into memory at all.
+MAX_FILE_BYTES = 4_000_000_000
+
+
+@dataclass(frozen=True)
+class CaseFiles:
+    """Names of the files that intake reads, relative to the case folder.
+
+    Attributes
+    ----------
+    label_map : str or None
+        None where the case brought meshes.
+    meshes : mapping of str to str
+        Structure name -> file; empty where the case brought a label map.
+    landmarks : str or None
+    """
+
+    label_map: str | None
+    meshes: Mapping[str, str]
+    landmarks: str | None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All of them."""
+        return tuple(name for name in (self.label_map, *self.meshes.values(), self.landmarks) if name is not None)
+
+
+def choose_files(names: Iterable[str]) -> CaseFiles:
+    """The label map or the meshes, and the landmarks, among the files of a case folder.
+
+    Raises
+    ------
+    CaseRejected
+        E-IO-15 when there is neither label map nor mesh, E-IO-16 when there is more than one candidate.
+    """
+    top = sorted(name for name in names if "/" not in name)
+    maps = [name for name in top if _is_label_map(name.lower())]
+    meshes = sorted(name for name in names if name.startswith("meshes/") and name.lower().endswith(MESH_ENDINGS))
+    landmarks = [name for name in top if name.lower().endswith(MARKUP_ENDINGS)]
+    if not maps and not meshes:
+        raise _no_segmentation(top)
+    if len(maps) > 1 or (maps and meshes):
+        raise _several("segmentation", [*maps, *meshes[:1]])
+    if len(landmarks) > 1:
+        raise _several("landmark file", landmarks)
+    by_structure = {PurePosixPath(name).stem: name for name in meshes}
+    if len(by_structure) != len(meshes):
+        raise _several("mesh of one structure", meshes)
+    return CaseFiles(maps[0] if maps else None, by_structure, landmarks[0] if landmarks else None)
+
+
+def read_file(source: SourceFolder, name: str) -> bytes:
+    """Bytes of one file of the case.
+
+    Raises
+    ------
+    CaseRejected
+        E-IO-14 for a file beyond MAX_FILE_BYTES, E-IO-17 for one that changed since the run began.
+    """
+    if (size := (source.root / name).stat().st_size) > MAX_FILE_BYTES:
+        problem = f"{name} has {size / 1e9:.1f} GB, expected at most {MAX_FILE_BYTES / 1e9:.0f} GB."
+        raise CaseRejected("E-IO-14", problem, "Crop the label map to the joint.")
+    try:
+        return source.read(name)
+    except ValueError as error:
+        action = "Wait until the file is copied completely, then run again."
+        raise CaseRejected("E-IO-17", f"{name} changed while it was being read.", action) from error
+
+
+def _is_label_map(name: str) -> bool:
+    endings = LABEL_MAP_ENDINGS + DETACHED_ENDINGS  # the latter so that their reader can say why not
+    return name.endswith(".seg.nrrd") or (name.startswith("labels.") and name.endswith(endings))
+
+
+def _no_segmentation(top: list[str]) -> CaseRejected:
+    return CaseRejected(
+        "E-IO-15",
+        f"The case folder holds no label map; it holds {', '.join(top[:8]) or 'no files'}.",
+        "Put the segmentation there as labels.nii.gz, labels.nrrd, labels.seg.nrrd or labels.mha.",
+    )
+
+
+def _several(what: str, names: list[str]) -> CaseRejected:
+    return CaseRejected(
+        "E-IO-16",
+        f"The case folder holds more than one {what}: {', '.join(names)}.",
+        "Keep the one to be used and move the others out of the folder.",
+    )

@@ -1,0 +1,176 @@
+"""A label map in any accepted format to one canonical volume: LPS order, right-handed, millimetres, whole numbers.
+
+The geometry gate and the value gate stand here once, for every format.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.engine.stage import Finding, Severity
+from pipeline.errors import CaseRejected
+from pipeline.files.foreign_image import ForeignImage, not_finite, unsupported
+from pipeline.files.metaimage_format import read_metaimage
+from pipeline.files.nrrd_format import read_nrrd
+from pipeline.geometry.volume import LabelVolume, axis_codes, in_lps_order, label_counts, shear
+
+#: Largest |cosine| between axes that is rounding of a header, not shear.
+MAX_SHEAR = 1e-4
+#: Voxel sizes that scanners make; outside this the unit is wrong.
+SPACING_MM = (0.1, 5.0)
+#: The smallest side may be a crop of a finger joint (20 mm), the largest a whole body (2.5 m).
+EXTENT_MM = (20.0, 2500.0)
+#: More different values than any label scheme has: it is an image.
+MAX_LABELS = 256
+#: Largest label value.
+MAX_VALUE = 65_535
+
+
+def _read_nifti(data: bytes, file: str) -> ForeignImage:
+    from pipeline.files.nifti_format import read_nifti  # noqa: PLC0415 - nibabel, which a cached run must not pay for
+
+    return read_nifti(data, file)
+
+
+_READERS: dict[str, Callable[[bytes, str], ForeignImage]] = {
+    ".nii": _read_nifti,
+    ".nii.gz": _read_nifti,
+    ".nrrd": read_nrrd,
+    ".mha": read_metaimage,
+}
+#: File name endings of label maps that are read (``.seg.nrrd`` is a ``.nrrd``).
+LABEL_MAP_ENDINGS = tuple(_READERS)
+#: Headers whose voxels lie in another file: refused, since such a header can name any file of the machine.
+DETACHED_ENDINGS = (".mhd", ".nhdr", ".hdr", ".img")
+
+_NOT_A_LABEL_MAP = "Give the segmentation (one whole number for each structure), not the CT itself."
+
+
+@dataclass(frozen=True, eq=False)
+class LabelMap:
+    """A label map that passed every gate.
+
+    Attributes
+    ----------
+    volume : LabelVolume
+        uint16, axes in the order and direction nearest to +L, +P, +S; right-handed.
+    segments : mapping of str to int
+        Segment name -> label value where the file names them, else empty.
+    counts : (65536,) int64
+        Voxels of each label value.
+    findings : tuple of Finding
+        What was assumed or changed.
+    """
+
+    volume: LabelVolume
+    segments: Mapping[str, int]
+    counts: NDArray[np.int64]
+    findings: tuple[Finding, ...]
+
+
+def read_label_map(data: bytes, file: str) -> LabelMap:
+    """Read a label map and refuse what cannot be trusted.
+
+    Parameters
+    ----------
+    data : bytes
+        The whole file.
+    file : str
+        Its name relative to the case folder; the ending chooses the format.
+
+    Raises
+    ------
+    CaseRejected
+        E-IO-*, E-GEO-*, E-LBL-02, E-LBL-04, E-LBL-05; see ``docs/messages.md``.
+    """
+    image = _reader(file)(data, file)
+    check_geometry(image.lps_from_index, image.values.shape, file)
+    values, notes = label_values(image.values, file)
+    if (found := int(np.count_nonzero(counts := label_counts(values)))) > MAX_LABELS:
+        raise _not_labels(file, f"it has {found} different values, expected at most {MAX_LABELS}")
+    volume = in_lps_order(LabelVolume(values, image.lps_from_index))
+    return LabelMap(volume, image.segments, counts, (*image.findings, *_handedness(image, file), *notes))
+
+
+def check_geometry(lps_from_index: NDArray[np.float64], shape: tuple[int, ...], file: str) -> None:
+    """The gate that every volume's matrix passes.
+
+    Raises
+    ------
+    CaseRejected
+        E-GEO-03 not finite or flat, E-GEO-04 sheared, E-GEO-06 voxel size, E-GEO-07 extent.
+    """
+    if not np.isfinite(lps_from_index).all() or abs(np.linalg.det(lps_from_index[:3, :3])) < 1e-12:
+        raise not_finite(file)
+    if not (oblique := shear(lps_from_index)) <= MAX_SHEAR:
+        degrees = float(np.degrees(np.arcsin(min(oblique, 1.0))))
+        raise CaseRejected(
+            "E-GEO-04",
+            f"The axes of {file} are not at right angles: {degrees:.3g} deg off, expected below {MAX_SHEAR} rad.",
+            "Undo the gantry tilt or shear by resampling the CT before it is segmented.",
+        )
+    spacing = np.linalg.norm(lps_from_index[:3, :3], axis=0)
+    action = "Check the unit and the voxel size of the export."
+    if outside := _outside(spacing, SPACING_MM):
+        raise CaseRejected("E-GEO-06", f"The voxel size of {file} is {outside}.", action)
+    if outside := _outside(spacing * np.asarray(shape[:3]), EXTENT_MM):
+        raise CaseRejected("E-GEO-07", f"The extent of {file} is {outside}.", action)
+
+
+def label_values(values: NDArray[Any], file: str) -> tuple[NDArray[np.uint16], tuple[Finding, ...]]:
+    """The voxels as uint16 labels, and a note where they came as fractions that happen to be whole.
+
+    Raises
+    ------
+    CaseRejected
+        E-LBL-02 for NaN, fractions, negative or large values.
+    """
+    low, high = values.min(), values.max()
+    if not (low >= 0 and high <= MAX_VALUE):  # also false for NaN
+        raise _not_labels(file, f"it has values from {low:g} to {high:g}, expected 0 to {MAX_VALUE}")
+    labels = values.astype(np.uint16)
+    if values.dtype.kind == "f" and not np.array_equal(labels, values):
+        raise _not_labels(file, "it has fractions, expected whole numbers")
+    if values.dtype.kind == "f":
+        text = f"{file} stores its labels as {values.dtype.name}; all are whole numbers and were taken as such."
+        return labels, (Finding("N-LBL-02", Severity.NOTE, text),)
+    return labels, ()
+
+
+def _reader(file: str) -> Callable[[bytes, str], ForeignImage]:
+    name = file.lower()
+    if name.endswith(DETACHED_ENDINGS):
+        raise unsupported(file, "its voxels are in another file")
+    for ending, reader in _READERS.items():
+        if name.endswith(ending):
+            return reader
+    raise unsupported(file, f"expected a file that ends in {', '.join(LABEL_MAP_ENDINGS)}")
+
+
+def _handedness(image: ForeignImage, file: str) -> tuple[Finding, ...]:
+    if np.linalg.det(image.lps_from_index[:3, :3]) > 0:
+        return ()
+    text = (
+        f"{file} stores its axes left-handed ({axis_codes(image.lps_from_index)}); one axis was reversed together "
+        "with its voxels, so that nothing is mirrored."
+    )
+    return (Finding("N-GEO-01", Severity.NOTE, text),)
+
+
+def _outside(actual_mm: NDArray[np.float64], limits_mm: tuple[float, float]) -> str:
+    """Empty when the three lengths are within the limits, else a description with a guess at the unit."""
+    low, high = limits_mm
+    if actual_mm.min() >= low and actual_mm.max() <= high:
+        return ""
+    guess = "metres" if actual_mm.max() < high / 500 else "micrometres" if actual_mm.min() > low * 500 else ""
+    lengths = " x ".join(f"{x:.4g}" for x in actual_mm)
+    return f"{lengths} mm, expected {low:g} to {high:g} mm" + (f" (it looks like {guess})" if guess else "")
+
+
+def _not_labels(file: str, problem: str) -> CaseRejected:
+    return CaseRejected("E-LBL-02", f"{file} is not a label map: {problem}.", _NOT_A_LABEL_MAP)

@@ -1,0 +1,1 @@
+"""Pure functions on numpy arrays: meshes, voxels, rigid motion, surfaces, landmarks."""

@@ -1,0 +1,1 @@
+"""Pure: joint coordinates, contact, solvers, sweep, smoothing, the table."""

@@ -1,0 +1,148 @@
+"""Smoothing: least-squares polynomials of x, y and rotation over the grid, contact re-established along delta.
+
+The basis is Chebyshev, both angles scaled to [-1, 1]; terms of total degree up to P in flexion and varus and of degree
+up to Q in varus (P = 6, the paper). With total degree 6 the fit is a polynomial of two variables in the sense of
+OpenSim's MultivariatePolynomialFunction, so nothing is lost in that export.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from pipeline.kinematics.cell import Cell, ProofSettings, failed_cell, measured_cell
+from pipeline.kinematics.contact import AttitudeContact, Bodies, Pose
+from pipeline.kinematics.descent import MotionSettings, drop
+from pipeline.kinematics.table import CurveFit, Float, Grid, PoseTable, RawTable, Status
+
+CURVES = (("lateral_mm", "mm"), ("anterior_mm", "mm"), ("internal_rotation_deg", "deg"))
+
+
+class Entry(NamedTuple):
+    """One entry to be made: its place in the table, its attitude in degrees, where to look for contact, its status."""
+
+    row: int
+    column: int
+    flexion_deg: float
+    varus_deg: float
+    start: Pose
+    status: Status
+
+
+class Probe(NamedTuple):
+    """An attitude between entries (degrees) and the pose a reader would interpolate there."""
+
+    flexion_deg: float
+    varus_deg: float
+    pose: Pose
+
+
+def scaled(values: Float, ends: Float) -> Float:
+    """Values with the two ends taken to -1 and 1; zeros where the ends are equal."""
+    half = 0.5 * (ends[1] - ends[0])
+    return (values - 0.5 * (ends[0] + ends[1])) / half if half > 0 else np.zeros_like(values)
+
+
+def ends(values: Float) -> Float:
+    """(2,) first and last of increasing values."""
+    return np.array([values[0], values[-1]])
+
+
+def fit_curves(raw: RawTable, degrees: tuple[int, int]) -> tuple[CurveFit, ...]:
+    """Least-squares fit of each found coordinate over the cells whose status is OK.
+
+    Parameters
+    ----------
+    raw : RawTable
+    degrees : (P, Q)
+        Wanted degree in flexion and varus; lowered where the grid has fewer values.
+
+    Raises
+    ------
+    ValueError
+        When there are fewer usable cells than the degree in flexion needs.
+    """
+    usable = raw.poses.status == Status.OK
+    p, q = min(degrees[0], raw.grid.shape[0] - 1), min(degrees[1], raw.grid.shape[1] - 1)
+    terms = _terms(p, q)
+    if usable.sum() < len(terms):
+        raise ValueError(f"{int(usable.sum())} usable cells cannot carry a polynomial of {len(terms)} terms")
+    design = _design(raw.grid, terms)[usable.ravel()]
+    return tuple(_fit(name, unit, getattr(raw.poses, name)[usable], design, terms) for name, unit in CURVES)
+
+
+def _terms(p: int, q: int) -> list[tuple[int, int]]:
+    return [(i, j) for i in range(p + 1) for j in range(q + 1) if i + j <= max(p, q)]
+
+
+def _design(grid: Grid, terms: Sequence[tuple[int, int]]) -> Float:
+    flexion = chebyshev.chebvander(scaled(grid.flexion_deg, ends(grid.flexion_deg)), max(i for i, _ in terms))
+    varus = chebyshev.chebvander(scaled(grid.varus_deg, ends(grid.varus_deg)), max(j for _, j in terms))
+    columns = [np.outer(flexion[:, i], varus[:, j]).ravel() for i, j in terms]
+    return np.column_stack(columns)
+
+
+def _fit(name: str, unit: str, values: Float, design: Float, terms: Sequence[tuple[int, int]]) -> CurveFit:
+    solution = np.linalg.lstsq(design, values, rcond=None)[0]
+    residual = values - design @ solution
+    coefficients = np.zeros((max(i for i, _ in terms) + 1, max(j for _, j in terms) + 1))
+    for (i, j), value in zip(terms, solution, strict=True):
+        coefficients[i, j] = value
+    rms = float(np.sqrt(np.mean(residual**2)))
+    return CurveFit(name, unit, coefficients, rms, float(np.abs(residual).max()))
+
+
+def evaluate(fit: CurveFit, grid: Grid) -> Float:
+    """(F, V) the fitted coordinate at every attitude of the grid it was fitted on."""
+    flexion = scaled(grid.flexion_deg, ends(grid.flexion_deg))
+    varus = scaled(grid.varus_deg, ends(grid.varus_deg))
+    return np.asarray(chebyshev.chebgrid2d(flexion, varus, fit.coefficients), dtype=np.float64)
+
+
+def entries(raw: RawTable, fits: Sequence[CurveFit]) -> tuple[Entry, ...]:
+    """What to re-establish contact for: usable cells, and single failed cells between two usable ones."""
+    x, y, turn = (evaluate(fit, raw.grid) for fit in fits)
+    out = []
+    for row, flexion in enumerate(raw.grid.flexion_deg):
+        for column, varus in enumerate(raw.grid.varus_deg):
+            status = _smoothed_status(raw.poses.status[:, column], row)
+            at = (row, column)
+            start = Pose(float(x[at]), float(y[at]), _depth(raw.poses, at), float(np.radians(turn[at])))
+            out.append(Entry(row, column, float(flexion), float(varus), start, status))
+    return tuple(out)
+
+
+def _smoothed_status(column: NDArray[np.uint8], row: int) -> Status:
+    status = Status(int(column[row]))
+    between = 0 < row < len(column) - 1 and column[row - 1] == column[row + 1] == Status.OK
+    return Status.SMOOTHED if status is not Status.OK and between else status
+
+
+def _depth(poses: PoseTable, at: tuple[int, int]) -> float:
+    """Raw z of the cell, or the lesser of its neighbours' where it failed: contact is looked for from there."""
+    row, column = at
+    near = poses.proximal_mm[max(row - 1, 0) : row + 2, column]
+    own = poses.proximal_mm[at]
+    return float(own if np.isfinite(own) else np.nanmin(near, initial=np.inf) if np.isfinite(near).any() else 0.0)
+
+
+def settle(bodies: Bodies, entry: Entry, motion: MotionSettings, proof: ProofSettings) -> Cell:
+    """One entry of the smoothed table: x, y and rotation as fitted, z by contact."""
+    if not entry.status.usable:
+        return failed_cell(entry.status)
+    contact = AttitudeContact(bodies, np.radians(entry.flexion_deg), np.radians(entry.varus_deg))
+    pose = drop(contact, entry.start, motion)
+    if pose is None:
+        return failed_cell(Status.NO_CONTACT)
+    return measured_cell(contact, pose, entry.status, proof)
+
+
+def way_to_contact(bodies: Bodies, probe: Probe, motion: MotionSettings) -> float:
+    """Signed way along delta from a pose to first contact, mm: + a gap, - an intersection; NaN without contact."""
+    contact = AttitudeContact(bodies, np.radians(probe.flexion_deg), np.radians(probe.varus_deg))
+    pose = drop(contact, probe.pose, motion)
+    return float("nan") if pose is None else pose.z + 0.5 * motion.tolerance_mm - probe.pose.z

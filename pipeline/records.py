@@ -1,0 +1,159 @@
+"""The small facts that stages leave for one another, as frozen dataclasses; on disk they are JSON.
+
+Arrays (volumes, meshes, tables) have types of their own in ``geometry`` and ``kinematics``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Side = Literal["right", "left"]
+Vector = tuple[float, float, float]
+Matrix = tuple[tuple[float, float, float, float], ...]
+Word = Literal["PASS", "REVIEW"]
+
+
+@dataclass(frozen=True)
+class CaseFacts:
+    """What intake established about a case.
+
+    Attributes
+    ----------
+    case_id : str
+    joint : str
+        Name of the joint file, such as ``knee``.
+    side : "right" or "left"
+        As declared; confirmed by anatomy later.
+    source : "labels" or "meshes"
+        What the case brought.
+    source_files : dict of str to str
+        Input file name (relative to the case folder) -> SHA-256.
+    structures : dict of str to int
+        Structure name -> label value in the canonical label volume (0 where the case brought meshes).
+    voxels : dict of str to int
+        Structure name -> number of voxels (0 where the case brought meshes).
+    spacing_mm : (i, j, k)
+        Voxel size; zeros where the case brought meshes.
+    shape : (i, j, k)
+        Voxel counts; zeros where the case brought meshes.
+    clipped_mm2 : dict of str to float
+        Structure name -> area of it that lies on the border of the volume (a shaft always does).
+    landmarks : dict of str to Vector
+        Landmarks that the user gave, LPS mm.
+    """
+
+    case_id: str
+    joint: str
+    side: Side
+    source: Literal["labels", "meshes"]
+    source_files: dict[str, str]
+    structures: dict[str, int]
+    voxels: dict[str, int]
+    spacing_mm: Vector
+    shape: tuple[int, int, int]
+    clipped_mm2: dict[str, float]
+    landmarks: dict[str, Vector]
+
+
+@dataclass(frozen=True)
+class MeshQuality:
+    """How well one mesh stands for its label.
+
+    ``deviation_*`` is the distance of the mesh from the unsmoothed label surface, mm.
+    """
+
+    name: str
+    triangles: int
+    volume_mm3: float
+    label_volume_mm3: float
+    deviation_rms_mm: float
+    deviation_max_mm: float
+    removed_voxels: int
+    filled_voxels: int
+
+
+@dataclass(frozen=True)
+class Landmark:
+    """A point of the anatomy, LPS mm, with how sure we are of it.
+
+    ``uncertainty_mm`` is one standard deviation; ``source`` is ``found`` or ``given``.
+    """
+
+    name: str
+    position: Vector
+    uncertainty_mm: float
+    source: Literal["found", "given"]
+
+
+@dataclass(frozen=True)
+class AxisEstimate:
+    """A direction of the anatomy in LPS with one standard deviation of its angle and how it was got."""
+
+    name: str
+    direction: Vector
+    uncertainty_deg: float
+    method: str
+
+
+@dataclass(frozen=True)
+class Anatomy:
+    """Landmarks, joint frames and delta of one joint, in scan space (LPS mm).
+
+    Attributes
+    ----------
+    scan_from_reference, scan_from_moving : 4x4
+        Kinematic frames, x lateral, y anterior, z proximal; the moving frame's z is delta. Left-handed (det -1)
+        for a left joint, so that one formula serves both sides.
+    delta : Vector
+        Direction in which the moving body is pushed, unit vector in scan space at the scan pose.
+    scan_attitude : 6 floats
+        Flexion, varus, internal rotation (deg), lateral, anterior, proximal (mm) of the scan itself.
+    axes : tuple of AxisEstimate
+    landmarks : tuple of Landmark
+    side_evidence : tuple of str
+        One sentence for each anatomical sign that told medial from lateral.
+    """
+
+    side: Side
+    landmarks: tuple[Landmark, ...]
+    axes: tuple[AxisEstimate, ...]
+    scan_from_reference: Matrix
+    scan_from_moving: Matrix
+    delta: Vector
+    scan_attitude: tuple[float, float, float, float, float, float]
+    side_evidence: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class SurfaceOrigin:
+    """Which structures make one contact body, and whether they were labelled or made by us."""
+
+    body: Literal["reference", "moving"]
+    structure: str
+    origin: Literal["labelled", "synthesised", "absent"]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One number of the verdict.
+
+    ``limit`` is a sentence such as ``at most 0.02``; ``state`` is ``ok``, ``review`` or ``info`` (no limit).
+    """
+
+    name: str
+    title: str
+    value: float
+    unit: str
+    limit: str
+    state: Literal["ok", "review", "info"]
+    meaning: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The judgement of one case: the word, at most three reasons in plain words, and every metric."""
+
+    word: Word
+    reasons: tuple[str, ...]
+    metrics: tuple[Metric, ...]

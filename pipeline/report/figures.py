@@ -1,0 +1,125 @@
+"""The pictures that a report must have, each with the four lines that tell a reader how to look at it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pipeline.adapters.pictures import png
+from pipeline.report.evidence import Evidence
+from pipeline.report.figure_bones import bones_picture
+from pipeline.report.figure_curves import checks_png, curves_png
+from pipeline.report.figure_poses import contact_picture, poses_picture
+from pipeline.report.figure_slices import slices_picture
+from pipeline.report.settings import Limits, PictureSettings
+
+
+@dataclass(frozen=True)
+class Caption:
+    """What a picture is, how a good and a bad one look, and what to do about a bad one."""
+
+    what: str
+    good: str
+    bad: str
+    action: str
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture of the report: file name without ending, title, caption, and how it is drawn (PNG bytes)."""
+
+    name: str
+    title: str
+    caption: Caption
+    draw: Callable[[Evidence, PictureSettings, Limits], bytes]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure and its PNG bytes, or empty bytes and why there are none."""
+
+    figure: Figure
+    data: bytes
+    problem: str = ""
+
+
+SLICES = Figure(
+    "slices",
+    "Labels and surfaces in three planes",
+    Caption(
+        "Cuts through the label map (grey) with the outlines of the surfaces made from it (colour).",
+        "Every outline runs along the border of its grey area, and cartilage lies on its bone.",
+        "An outline leaves its area, a structure is missing or sits on the wrong bone, left and right are exchanged.",
+        "Correct the segmentation, or the label names in case.yaml, and run the case again.",
+    ),
+    lambda evidence, settings, _: png(slices_picture(evidence, settings)),
+)
+BONES = Figure(
+    "bones",
+    "Bones, landmarks and axes",
+    Caption(
+        "The surfaces at the pose of the scan with the landmarks, the flexion axis, the long axis and the push Δ.",
+        "The flexion axis passes through both condyles, the long axis along the shaft, Δ along the tibia.",
+        "An axis leaves its bone or is clearly tilted; a landmark lies on the wrong side or off the bone.",
+        "Place the landmark in 3D Slicer, save landmarks.mrk.json beside the label map, and run the case again.",
+    ),
+    lambda evidence, settings, _: png(bones_picture(evidence, settings)),
+)
+POSES = Figure(
+    "poses",
+    "The joint at several flexions",
+    Caption(
+        "Poses of the table at neutral varus, from four sides; the first bone stands still.",
+        "Both sides rest on one another at every flexion, and the lower bone turns evenly.",
+        "A bone floats, sinks in, slides off or turns suddenly.",
+        "Look at the curves at that flexion; check axes and contact surfaces before the table is used there.",
+    ),
+    lambda evidence, settings, _: png(poses_picture(evidence, settings)),
+)
+CONTACT = Figure(
+    "contact",
+    "Where the surfaces touch",
+    Caption(
+        "The joint surface of the moving body from above, coloured by its distance to the other body.",
+        "One dark spot on the medial and one on the lateral side, moving backwards a little with flexion.",
+        "A dark spot on the rim only, on one side only, or orange areas (overlap).",
+        "Check cartilage and menisci in the label map; a one-sided contact may mean that the varus does not fit.",
+    ),
+    lambda evidence, settings, _: png(contact_picture(evidence, settings)),
+)
+CURVES = Figure(
+    "curves",
+    "Found coordinates against flexion",
+    Caption(
+        "The four coordinates that the program found: dots as found, lines after smoothing, one colour for each varus.",
+        "Dots lie close to their line, and lines of neighbouring varus run side by side.",
+        "Dots jump away from the line, lines cross wildly, crosses mark attitudes without a pose.",
+        "Jumps come from rough surfaces: look at the contact picture there. Steep rotation: check the flexion axis.",
+    ),
+    lambda evidence, _settings, _limits: curves_png(evidence),
+)
+CHECKS = Figure(
+    "checks",
+    "Contact and repeatability against flexion",
+    Caption(
+        "What is left of gap or overlap after smoothing, the gap of each side, and bending against straightening.",
+        "Contact error within the dashed lines; at neutral varus both gaps are small; hysteresis near zero.",
+        "Contact error beyond the dashed lines, one side wide open at every varus, hysteresis above 1 mm.",
+        "Use a finer grid or a higher degree of smoothing where contact is lost; check the axes where a side is open.",
+    ),
+    lambda evidence, _, limits: checks_png(evidence, limits),
+)
+
+
+def expected_figures(evidence: Evidence) -> tuple[Figure, ...]:
+    """The figures that the report of a case must have; slices only where the case brought a label map."""
+    rest = (BONES, POSES, CONTACT, CURVES, CHECKS)
+    return rest if evidence.facts.source == "meshes" else (SLICES, *rest)
+
+
+def drawn(figure: Figure, evidence: Evidence, settings: PictureSettings, limits: Limits) -> Drawn:
+    """The figure, or why it cannot be drawn from this evidence (one the drawing refuses with ValueError)."""
+    try:
+        return Drawn(figure, figure.draw(evidence, settings, limits))
+    except ValueError as error:
+        return Drawn(figure, b"", str(error))

@@ -1,0 +1,232 @@
+"""The numbers of the verdict: pure functions from evidence to metrics.
+
+A number has a limit only where the program guarantees something: closed meshes that stand for their labels, a pose for
+every entry, contact without gap or overlap. Everything else informs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.mesh import TriangleMesh, edge_defects
+from pipeline.kinematics.table import Grid, PoseTable, SmoothTable, Status
+from pipeline.records import Metric
+from pipeline.report.evidence import CURVES, STATUS_WORDS, Evidence, plain, usable
+from pipeline.report.settings import Limits
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A number before it is judged; the fields are those of :class:`pipeline.records.Metric`."""
+
+    name: str
+    title: str
+    value: float
+    unit: str
+    meaning: str
+
+
+def info(measured: Measured) -> Metric:
+    """A number without a limit."""
+    return Metric(**vars(measured), limit="none", state="info")
+
+
+def at_most(measured: Measured, limit: float) -> Metric:
+    """A number that must not exceed a limit."""
+    return _judged(measured, f"at most {limit:g}", ok=measured.value <= limit)
+
+
+def at_least(measured: Measured, limit: float) -> Metric:
+    """A number that must reach a limit."""
+    return _judged(measured, f"at least {limit:g}", ok=measured.value >= limit)
+
+
+def _judged(measured: Measured, limit: str, *, ok: bool) -> Metric:
+    return Metric(**vars(measured), limit=limit, state="ok" if ok else "review")
+
+
+def all_metrics(evidence: Evidence, limits: Limits) -> tuple[Metric, ...]:
+    """Every number of the verdict, in the order of the flow; one that cannot be measured is left out."""
+    return (
+        *_mesh_metrics(evidence, limits),
+        *_anatomy_metrics(evidence),
+        *_sweep_metrics(evidence, limits),
+        *_scan_pose_metrics(evidence),
+        *_smooth_metrics(evidence, limits),
+    )
+
+
+def open_edges(mesh: TriangleMesh) -> int:
+    """Number of edges that keep a mesh from being a closed, oriented surface."""
+    return sum(vars(edge_defects(mesh.triangles)).values())
+
+
+def _mesh_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
+    meshes = [*evidence.meshes.values(), evidence.reference, evidence.moving]
+    defects = sum(open_edges(mesh) for mesh in meshes)
+    meaning = "Edges of surfaces that do not close; a surface with a hole has no inside, and contact means nothing."
+    yield at_most(Measured("open_edges", "Open edges of all surfaces", float(defects), "edges", meaning), 0)
+    if evidence.mesh_quality:
+        errors = {q.name: 100.0 * abs(q.volume_mm3 / q.label_volume_mm3 - 1.0) for q in evidence.mesh_quality}
+        worst = max(errors, key=lambda name: errors[name])
+        meaning = f"How much a surface is larger or smaller than its label; worst in {plain(worst)}."
+        volume = Measured("mesh_volume_error", "Volume of surface against label", errors[worst], "%", meaning)
+        yield at_most(volume, limits.max_volume_error_percent)
+        far = max(evidence.mesh_quality, key=lambda q: q.deviation_max_mm)
+        meaning = f"Largest distance of a surface from the border of its label; in {plain(far.name)}."
+        yield info(Measured("mesh_deviation_max", "Surface off its label", far.deviation_max_mm, "mm", meaning))
+
+
+def _anatomy_metrics(evidence: Evidence) -> Iterator[Metric]:
+    anatomy = evidence.anatomy
+    if anatomy.landmarks:
+        worst = max(anatomy.landmarks, key=lambda landmark: landmark.uncertainty_mm)
+        meaning = f"One standard deviation of the least certain landmark, {plain(worst.name)}."
+        yield info(Measured("landmark_uncertainty", "Landmark uncertainty", worst.uncertainty_mm, "mm", meaning))
+    for axis in anatomy.axes:
+        title = f"Uncertainty of {plain(axis.name)}"
+        meaning = f"One standard deviation of its direction ({axis.method}); it leaks into rotation and varus."
+        yield info(Measured(f"axis_uncertainty.{axis.name}", title, axis.uncertainty_deg, "deg", meaning))
+    meaning = "Anatomical signs that told medial from lateral and agree with the declared side."
+    yield info(
+        Measured("side_signs", "Signs that confirm the side", float(len(anatomy.side_evidence)), "signs", meaning)
+    )
+
+
+def _sweep_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
+    raw = evidence.raw
+    found = usable(raw.poses)
+    shown = usable(evidence.smooth.poses)
+    meaning = "Attitudes of the table that have a stable pose; the others are marked and never shown."
+    cells = Measured("usable_cells", "Usable entries of the table", float(shown.sum()), "entries", meaning)
+    yield at_least(cells, shown.size)
+    for status in Status:
+        count = int((raw.poses.status == status).sum())
+        if count and not status.usable:
+            meaning = f"Attitudes where the search ended so: {STATUS_WORDS[status]}."
+            title = f"Raw entries: {STATUS_WORDS[status]}"
+            yield info(Measured(f"raw_status.{status.name.lower()}", title, float(count), "entries", meaning))
+    if found.any():
+        meaning = "Pulled back by so much the bones are clear, pushed on by so much they meet: exact test, worst entry."
+        gaps = np.stack([raw.gap_before_mm[found], raw.gap_after_mm[found]])
+        limit = limits.max_raw_contact_error_mm
+        yield from _worst(
+            Measured("raw_contact_gap", "Contact of raw poses proven within", 0.0, "mm", meaning), gaps, limit
+        )
+        yield from _repeatability_metrics(evidence, limits)
+
+
+def _repeatability_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
+    raw = evidence.raw
+    meaning = "Difference of bending and straightening, largest; below 1 mm and 2 deg in the literature."
+    for values, unit in ((raw.hysteresis_mm, "mm"), (raw.hysteresis_deg, "deg")):
+        if np.isfinite(values).any():
+            title = f"Hysteresis ({'shift' if unit == 'mm' else 'rotation'})"
+            yield info(Measured(f"hysteresis_{unit}", title, float(np.nanmax(values)), unit, meaning))
+    if raw.grid.shape == evidence.smooth.grid.shape:
+        yield from _jump_metrics(evidence, limits)
+
+
+def _jump_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
+    shift, turn = jumps(evidence.raw.poses, evidence.smooth.poses)
+    count = int(((shift > limits.jump_mm) | (turn > limits.jump_deg)).sum())
+    meaning = (
+        f"Neighbouring raw poses that differ by {limits.jump_mm:g} mm or {limits.jump_deg:g} deg more than the fit."
+    )
+    yield info(Measured("jumps", "Jumps between neighbouring poses", float(count), "jumps", meaning))
+    meaning = "Largest step between neighbouring raw poses beyond that of the fit; rough surfaces make jumps."
+    for name, title, values, unit in (("mm", "shift", shift, "mm"), ("deg", "rotation", turn, "deg")):
+        if np.isfinite(values).any():
+            yield info(Measured(f"jump_{name}", f"Largest jump ({title})", float(np.nanmax(values)), unit, meaning))
+
+
+def jumps(raw: PoseTable, fitted: PoseTable) -> tuple[Float, Float]:
+    """Steps of raw minus fitted between neighbours along flexion and varus, shift (K,) mm and rotation (K,) deg.
+
+    Taking the fit off first leaves out the motion itself, so the measure does not depend on the step of the grid. NaN
+    beside an unusable entry.
+    """
+    both = usable(raw) & usable(fitted)
+    names = [name for name, _, _ in CURVES]
+    rest = np.stack([np.where(both, getattr(raw, name) - getattr(fitted, name), np.nan) for name in names], axis=-1)
+    steps = np.concatenate([np.diff(rest, axis=0).reshape(-1, 4), np.diff(rest, axis=1).reshape(-1, 4)])
+    return np.linalg.norm(steps[:, :3], axis=1), np.abs(steps[:, 3])
+
+
+def _scan_pose_metrics(evidence: Evidence) -> Iterator[Metric]:
+    flexion, varus, rotation, *shift = evidence.anatomy.scan_attitude
+    found = interpolated(evidence.raw.grid, evidence.raw.poses, flexion, varus)
+    if found is None:
+        return
+    off_mm, off_deg = float(np.linalg.norm(found[:3] - shift)), abs(float(found[3]) - rotation)
+    labelled = all(origin.origin == "labelled" for origin in evidence.origins)
+    hint = "small where cartilage and menisci were labelled" if labelled else "surfaces were made: expect millimetres"
+    meaning = f"Pose found at the attitude of the scan against the scan itself; {hint}."
+    yield info(Measured("scan_pose_mm", "Scan pose found again (shift)", off_mm, "mm", meaning))
+    yield info(Measured("scan_pose_deg", "Scan pose found again (rotation)", off_deg, "deg", meaning))
+
+
+def interpolated(grid: Grid, poses: PoseTable, flexion_deg: float, varus_deg: float) -> Float | None:
+    """The found coordinates (4,) at an attitude, bilinear; None outside the grid or beside an unusable entry."""
+    weights = []
+    for axis, value in ((grid.flexion_deg, flexion_deg), (grid.varus_deg, varus_deg)):
+        if not axis[0] <= value <= axis[-1]:
+            return None
+        weights.append(np.array([np.interp(value, axis, row) for row in np.eye(len(axis))]))
+    weight = np.outer(*weights)
+    touched = weight > 0.0
+    if not usable(poses)[touched].all():
+        return None
+    return np.array([float((getattr(poses, name)[touched] * weight[touched]).sum()) for name, _, _ in CURVES])
+
+
+def _smooth_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
+    smooth = evidence.smooth
+    for fit in smooth.fits:
+        title = f"Smoothing residual of {plain(fit.name.removesuffix('_' + fit.unit))}"
+        meaning = f"Root mean square of raw minus fitted; largest {fit.residual_max:.3g} {fit.unit}."
+        yield info(Measured(f"residual_rms.{fit.name}", title, fit.residual_rms, fit.unit, meaning))
+    meaning = "Largest gap or overlap that is left at an entry after smoothing: exact test on the triangles."
+    entry = Measured("contact_error", "Contact at the entries", 0.0, "mm", meaning)
+    yield from _worst(entry, smooth.contact_error_mm, limits.max_contact_error_mm)
+    meaning = "The same half-way between entries, as a viewer interpolates; 0.145 mm is the limit of perception."
+    midpoint = Measured("midpoint_error", "Contact between entries", 0.0, "mm", meaning)
+    yield from _worst(midpoint, smooth.midpoint_error_mm, limits.max_midpoint_error_mm)
+    meaning = "Usable entries, and middles between two of them, whose contact was not tested."
+    yield at_most(Measured("untested", "Untested entries", float(untested(smooth)), "entries", meaning), 0)
+    yield from _balance_metrics(evidence)
+
+
+def untested(smooth: SmoothTable) -> int:
+    """Number of usable entries, and of middles between usable entries along flexion, without a contact error."""
+    shown = usable(smooth.poses)
+    entries = shown & ~np.isfinite(smooth.contact_error_mm)
+    middles = shown[1:] & shown[:-1] & ~np.isfinite(smooth.midpoint_error_mm)
+    return int(entries.sum() + middles.sum())
+
+
+def _worst(measured: Measured, values: Float, limit: float) -> Iterator[Metric]:
+    known = np.abs(values[np.isfinite(values)])
+    if known.size:
+        yield at_most(replace(measured, value=float(known.max())), limit)
+
+
+def _balance_metrics(evidence: Evidence) -> Iterator[Metric]:
+    for kind, poses in (("raw", evidence.raw.poses), ("smoothed", evidence.smooth.poses)):
+        values = poses.equilibrium_residual[usable(poses)]
+        if np.isfinite(values).any():
+            meaning = "How far the contact forces are from balance, median; 0 is perfect rest, 1 is none."
+            title = f"Equilibrium of {kind} poses"
+            yield info(Measured(f"equilibrium_{kind}", title, float(np.nanmedian(values)), "", meaning))
+    poses = evidence.smooth.poses
+    for side, gap in (("medial", poses.medial_gap_mm), ("lateral", poses.lateral_gap_mm)):
+        values = gap[usable(poses)]
+        if np.isfinite(values).any():
+            meaning = f"Largest distance left on the {side} side; both sides touch only where the varus fits."
+            yield info(Measured(f"{side}_gap", f"Largest {side} gap", float(np.nanmax(values)), "mm", meaning))

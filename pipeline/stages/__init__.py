@@ -1,0 +1,1 @@
+"""One thin file a stage: load, call the maths, save, return findings."""

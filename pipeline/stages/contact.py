@@ -1,0 +1,137 @@
+"""Stage 50: the two rigid bodies that meet: what was labelled, as one closed surface each, in scan space."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from pipeline.adapters.mask_surface import SurfaceResult, SurfaceSettings, mask_to_mesh
+from pipeline.artifacts import ANATOMY, CASE_FACTS, LABELS, MESHES, MOVING_BODY, REFERENCE_BODY, SURFACE_ORIGINS
+from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage, StrictParams
+from pipeline.errors import CaseRejected
+from pipeline.geometry.mesh import TriangleMesh, merged
+from pipeline.geometry.volume import LabelVolume
+from pipeline.records import Anatomy, CaseFacts, SurfaceOrigin
+
+Mask = NDArray[np.bool_]
+
+
+class Params(StrictParams):
+    """Which structures make each body, and how finely they are meshed."""
+
+    reference: list[str] = Field(min_length=1, description="structures of the body that stands still")
+    moving: list[str] = Field(min_length=1, description="structures of the body that moves, rigid on one another")
+    triangles: int = Field(40_000, ge=500, le=400_000, description="triangles of each body")
+    reach_mm: float = Field(
+        90.0, gt=10, le=1000, description="what lies farther than this from the joint never meets and is left out"
+    )
+
+
+def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
+    """Make both contact bodies."""
+    facts = reads[CASE_FACTS]
+    present = [name for name in (*params.reference, *params.moving) if name in facts.structures]
+    if facts.source == "meshes":
+        meshes = reads[MESHES]
+        out[REFERENCE_BODY] = _of_meshes(meshes, params.reference)
+        out[MOVING_BODY] = _of_meshes(meshes, params.moving)
+        findings: Findings = ()
+    else:
+        findings = _of_labels(reads, params, out)
+    out[SURFACE_ORIGINS] = _origins(params, present)
+    return findings + _missing_surfaces(params, present)
+
+
+def _of_meshes(meshes: Mapping[str, TriangleMesh], names: list[str]) -> TriangleMesh:
+    return merged([meshes[name] for name in names if name in meshes])
+
+
+def _of_labels(reads: Inputs, params: Params, out: Outputs) -> Findings:
+    labels, facts, anatomy = reads[LABELS], reads[CASE_FACTS], reads[ANATOMY]
+    if labels is None:
+        raise ValueError("a case of labels has no label volume")
+    near = _near_joint(labels, anatomy, params.reach_mm)
+    masks = [_mask(labels, facts, names) & near for names in (params.reference, params.moving)]
+    settings = SurfaceSettings(triangles=params.triangles)
+    findings: list[Finding] = []
+    for artifact, mask, other, name in (
+        (REFERENCE_BODY, masks[0], masks[1], "reference"),
+        (MOVING_BODY, masks[1], masks[0], "moving"),
+    ):
+        result = _surface(mask, other, labels, settings, name)
+        out[artifact] = result.mesh
+        findings.append(_described(name, result))
+    return tuple(findings)
+
+
+def _surface(mask: Mask, other: Mask, labels: LabelVolume, settings: SurfaceSettings, name: str) -> SurfaceResult:
+    try:
+        return mask_to_mesh(mask, labels.lps_from_index, settings, keep_out=other)
+    except ValueError as error:
+        raise CaseRejected(
+            "E-CON-01",
+            f"The {name} contact body has no closed surface: {error}.",
+            "Look at its labels for holes and loose voxels.",
+        ) from error
+
+
+def _described(name: str, result: SurfaceResult) -> Finding:
+    return Finding(
+        "N-CON-01",
+        Severity.NOTE,
+        f"{name.capitalize()} body: {len(result.mesh.triangles)} triangles, {result.deviation.rms_mm:.2f} mm RMS and "
+        f"{result.deviation.max_mm:.2f} mm at most from the voxel surface, "
+        f"volume {100 * result.volume_error:+.1f} %.",
+    )
+
+
+def _mask(labels: LabelVolume, facts: CaseFacts, names: list[str]) -> Mask:
+    values = [facts.structures[name] for name in names if name in facts.structures]
+    mask: Mask = np.isin(labels.values, values)
+    return mask
+
+
+def _near_joint(labels: LabelVolume, anatomy: Anatomy, reach_mm: float) -> Mask:
+    """Voxels within the reach of the moving frame's origin."""
+    origin = np.asarray(anatomy.scan_from_moving)[:3, 3]
+    matrix = labels.lps_from_index
+    offset = matrix[:3, 3] - origin
+    axes = [np.arange(n, dtype=np.float64) for n in labels.values.shape]
+    squared = sum(
+        (
+            matrix[r, 0] * axes[0][:, None, None]
+            + matrix[r, 1] * axes[1][None, :, None]
+            + matrix[r, 2] * axes[2]
+            + offset[r]
+        )
+        ** 2
+        for r in range(3)
+    )
+    near: Mask = squared < reach_mm**2
+    return near
+
+
+def _origins(params: Params, present: list[str]) -> tuple[SurfaceOrigin, ...]:
+    rows = [("reference", name) for name in params.reference] + [("moving", name) for name in params.moving]
+    return tuple(SurfaceOrigin(body, name, "labelled" if name in present else "absent") for body, name in rows)  # type: ignore[arg-type]
+
+
+def _missing_surfaces(params: Params, present: list[str]) -> Findings:
+    absent = [name.replace("_", " ") for name in (*params.reference, *params.moving) if name not in present]
+    if not absent:
+        return ()
+    message = f"Not labelled and therefore not part of the contact: {', '.join(absent)}."
+    return (Finding("W-CON-01", Severity.REVIEW, message),)
+
+
+STAGE = Stage(
+    50,
+    "contact",
+    (CASE_FACTS, LABELS, MESHES, ANATOMY),
+    (REFERENCE_BODY, MOVING_BODY, SURFACE_ORIGINS),
+    Params,
+    run,
+)

@@ -1,0 +1,199 @@
+"""Stage 10, intake: the only place that touches foreign files.
+
+It turns whatever the case brought into one canonical label volume (or named meshes) in LPS millimetres, and refuses,
+with the reason, what cannot be trusted. Later stages never see a foreign file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, StringConstraints
+
+from pipeline.artifacts import CASE_FACTS, GIVEN_MESHES, LABELS
+from pipeline.engine.artifacts import SOURCE, SourceFolder
+from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage, StrictParams
+from pipeline.errors import CaseRejected
+from pipeline.files.case_files import CaseFiles, choose_files, read_file
+from pipeline.files.markups import read_markups
+from pipeline.files.meshes import read_mesh
+from pipeline.files.volumes import LabelMap, read_label_map
+from pipeline.geometry.label_cleaning import LabelRepair, clean_label
+from pipeline.geometry.mesh import TriangleMesh
+from pipeline.geometry.volume import LabelVolume, border_areas_mm2, box_of, cropped
+from pipeline.label_review import (
+    is_soft,
+    review_anisotropy,
+    review_clipping,
+    review_order,
+    review_pieces,
+    review_touching,
+    review_unused,
+)
+from pipeline.label_scheme import MARGIN_VOXELS, number_structures, renumbered, structure_values
+from pipeline.records import CaseFacts, Side
+
+StructureName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
+LabelValue = Annotated[int, Field(ge=1, le=65_535)]
+
+
+class Params(StrictParams):
+    """What the case declares about itself, and what its joint needs."""
+
+    joint: str = Field(default="knee", pattern=r"^[a-z][a-z0-9_-]{0,63}$", description="name of the joint file")
+    side: Side | None = Field(default=None, description="side of the body; never guessed")
+    labels: dict[StructureName, LabelValue] = Field(
+        default_factory=dict, max_length=255, description="structure name -> value in the label map"
+    )
+    required: list[StructureName] = Field(
+        default_factory=list, max_length=255, description="structures without which there is no result"
+    )
+    optional: list[StructureName] = Field(
+        default_factory=list, max_length=255, description="structures that are used where they are labelled"
+    )
+
+    @property
+    def wanted(self) -> frozenset[str]:
+        """Structures that are used where present."""
+        return frozenset((*self.required, *self.optional))
+
+
+def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
+    """Read the case, check it, and leave its canonical form.
+
+    Raises
+    ------
+    CaseRejected
+        E-SIDE-01, E-IO-*, E-GEO-*, E-LBL-*, E-LMK-*; see ``docs/messages.md``.
+    """
+    source = reads[SOURCE]
+    side = _declared_side(params)
+    files = choose_files(source.files)
+    facts = _common_facts(source, files, params, side)
+    if files.label_map is None:
+        meshes, findings = _given_meshes(source, files.meshes, params, out)
+        out[CASE_FACTS], out[LABELS], out[GIVEN_MESHES] = _facts_of_meshes(facts, meshes), None, meshes
+        return findings
+    label_map = read_label_map(read_file(source, files.label_map), files.label_map)
+    return _take_labels(label_map, files.label_map, params, facts, out)
+
+
+STAGE = Stage(10, "intake", (SOURCE,), (CASE_FACTS, LABELS, GIVEN_MESHES), Params, run)
+
+
+def _declared_side(params: Params) -> Side:
+    if params.side is None:
+        raise CaseRejected(
+            "E-SIDE-01",
+            "The side of the body is not given with the case; it is never guessed.",
+            "Write 'side: right' or 'side: left' in case.yaml.",
+        )
+    return params.side
+
+
+def _common_facts(source: SourceFolder, files: CaseFiles, params: Params, side: Side) -> CaseFacts:
+    """What holds for either kind of case; everything about labels is still empty."""
+    landmarks = files.landmarks
+    return CaseFacts(
+        case_id=source.case_id,
+        joint=params.joint,
+        side=side,
+        source="meshes" if files.label_map is None else "labels",
+        source_files={name: source.files[name] for name in files.names},
+        structures={},
+        voxels={},
+        spacing_mm=(0.0, 0.0, 0.0),
+        shape=(0, 0, 0),
+        clipped_mm2={},
+        landmarks={} if landmarks is None else read_markups(read_file(source, landmarks), landmarks),
+    )
+
+
+def _given_meshes(
+    source: SourceFolder, files: Mapping[str, str], params: Params, out: Outputs
+) -> tuple[dict[str, TriangleMesh], Findings]:
+    """The wanted meshes by structure name."""
+    if missing := [name for name in params.required if name not in files]:
+        problem = f"There is no mesh of {missing[0]}; meshes/ holds {', '.join(sorted(files))}."
+        raise CaseRejected("E-LBL-01", problem, f"Put it there as meshes/{missing[0]}.ply or .stl.")
+    meshes: dict[str, TriangleMesh] = {}
+    findings: list[Finding] = []
+    for done, (name, file) in enumerate(sorted(files.items())):
+        out.progress(done, len(files))
+        if name not in params.wanted:
+            findings.append(Finding("N-LBL-01", Severity.NOTE, f"{file} is no structure of this joint; not used."))
+            continue
+        given = read_mesh(read_file(source, file), file)
+        meshes[name] = given.mesh
+        findings += given.findings
+    return meshes, tuple(findings)
+
+
+def _facts_of_meshes(facts: CaseFacts, meshes: Mapping[str, TriangleMesh]) -> CaseFacts:
+    return replace(
+        facts,
+        structures=dict.fromkeys(meshes, 0),
+        voxels=dict.fromkeys(meshes, 0),
+        clipped_mm2=dict.fromkeys(meshes, 0.0),
+    )
+
+
+def _take_labels(label_map: LabelMap, file: str, params: Params, facts: CaseFacts, out: Outputs) -> Findings:
+    """Map, clean and judge the labels; leave the three artifacts."""
+    values, notes = structure_values(label_map.segments, params.labels, params.wanted, file)
+    structures = number_structures(values, label_map.counts, params.required, file)
+    volume, repairs = _cleaned(renumbered(label_map.volume, values, structures), structures, out)
+    out[CASE_FACTS] = _facts_of_labels(facts, volume, structures, repairs)
+    out[LABELS] = volume
+    out[GIVEN_MESHES] = {}
+    used = [values[name] for name in structures]
+    return (
+        *label_map.findings,
+        *notes,
+        *review_unused(label_map.counts, used, file),
+        *review_pieces(repairs, params.required, file),
+        *review_order(volume, structures, file),
+        *review_touching(volume, structures),
+        *review_anisotropy(volume.spacing_mm),
+        *(finding for name in structures for finding in review_clipping(name, _on_border(volume, structures[name]))),
+    )
+
+
+def _cleaned(
+    volume: LabelVolume, structures: Mapping[str, int], out: Outputs
+) -> tuple[LabelVolume, dict[str, LabelRepair]]:
+    """Islands taken away and cavities filled, structure by structure."""
+    values = np.array(volume.values)
+    repairs: dict[str, LabelRepair] = {}
+    for done, (name, number) in enumerate(structures.items()):
+        out.progress(done, len(structures))
+        box = box_of(values == number)
+        part = values[box]
+        mask, repairs[name] = clean_label(part == number, part == 0, one_piece=not is_soft(name))
+        part[(part == number) & ~mask] = 0
+        part[mask] = number
+    # again, because an island may have held the volume open
+    return cropped(LabelVolume(values, volume.lps_from_index), MARGIN_VOXELS), repairs
+
+
+def _facts_of_labels(
+    facts: CaseFacts, volume: LabelVolume, structures: Mapping[str, int], repairs: Mapping[str, LabelRepair]
+) -> CaseFacts:
+    i, j, k = volume.values.shape
+    x, y, z = map(float, volume.spacing_mm)
+    return replace(
+        facts,
+        structures=dict(structures),
+        voxels={name: repair.voxels for name, repair in repairs.items()},
+        spacing_mm=(x, y, z),
+        shape=(i, j, k),
+        clipped_mm2={name: float(_on_border(volume, number).sum()) for name, number in structures.items()},
+    )
+
+
+def _on_border(volume: LabelVolume, number: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """(6,) area of one structure on each face of the volume; cropping kept the faces that labels touch."""
+    return border_areas_mm2(np.asarray(volume.values) == number, volume.spacing_mm)

@@ -1,0 +1,98 @@
+"""Stage 80, qa: numbers, verdict, pictures and the report page."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from pipeline.artifacts import (
+    ANATOMY,
+    CASE_FACTS,
+    LABELS,
+    MESH_QUALITY,
+    MESHES,
+    MOVING_BODY,
+    RAW_TABLE,
+    REFERENCE_BODY,
+    REPORT,
+    SMOOTH_TABLE,
+    SURFACE_ORIGINS,
+    VERDICT,
+)
+from pipeline.engine.stage import Findings, Inputs, Outputs, Stage, StrictParams, findings_of
+from pipeline.report.build import STYLE, TEMPLATE, Page, report_files
+from pipeline.report.evidence import Evidence
+from pipeline.report.figures import Drawn, drawn, expected_figures
+from pipeline.report.metrics import all_metrics
+from pipeline.report.settings import Limits, PictureSettings
+from pipeline.report.verdict import judge, metric_findings, picture_findings
+
+FINDINGS = {name: findings_of(name) for name in ("intake", "mesh", "anatomy", "contact", "sweep", "smooth")}
+
+
+class Params(StrictParams):
+    """Settings of the quality report."""
+
+    limits: Limits = Field(default=Limits(), description="what is guaranteed; beyond it a person has to look")
+    pictures: PictureSettings = Field(default=PictureSettings(), description="what the pictures show")
+
+
+def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
+    """Measure, draw, judge, and write the report."""
+    evidence = gather(reads)
+    metrics = all_metrics(evidence, params.limits)
+    pictures = _draw(evidence, params, out)
+    missing = {item.figure.title: item.problem for item in pictures if not item.data}
+    findings = (*metric_findings(metrics), *picture_findings(missing))
+    verdict = judge(metrics, findings, evidence.findings)
+    out[VERDICT] = verdict
+    out[REPORT] = report_files(Page(evidence, verdict, pictures, findings, params.pictures))
+    return findings
+
+
+def gather(reads: Inputs) -> Evidence:
+    """What the stages before left, as evidence."""
+    return Evidence(
+        facts=reads[CASE_FACTS],
+        labels=reads[LABELS],
+        meshes=reads[MESHES],
+        mesh_quality=reads[MESH_QUALITY],
+        anatomy=reads[ANATOMY],
+        reference=reads[REFERENCE_BODY],
+        moving=reads[MOVING_BODY],
+        origins=reads[SURFACE_ORIGINS],
+        raw=reads[RAW_TABLE],
+        smooth=reads[SMOOTH_TABLE],
+        findings={name: reads[artifact] for name, artifact in FINDINGS.items()},
+    )
+
+
+def _draw(evidence: Evidence, params: Params, out: Outputs) -> list[Drawn]:
+    figures, pictures = expected_figures(evidence), []
+    for done, figure in enumerate(figures):
+        out.progress(done, len(figures))
+        pictures.append(drawn(figure, evidence, params.pictures, params.limits))
+    out.progress(len(figures), len(figures))
+    return pictures
+
+
+STAGE = Stage(
+    number=80,
+    name="qa",
+    reads=(
+        CASE_FACTS,
+        LABELS,
+        MESHES,
+        MESH_QUALITY,
+        ANATOMY,
+        REFERENCE_BODY,
+        MOVING_BODY,
+        SURFACE_ORIGINS,
+        RAW_TABLE,
+        SMOOTH_TABLE,
+        *FINDINGS.values(),
+    ),
+    writes=(VERDICT, REPORT),
+    Params=Params,
+    run=run,
+    resources=(f"pipeline.report:{TEMPLATE}", f"pipeline.report:{STYLE}"),
+)

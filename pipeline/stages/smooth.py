@@ -1,0 +1,93 @@
+"""Stage 70: polynomials over the found coordinates, contact re-established, every entry and midpoint re-tested."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.adapters.contact_pool import ContactPair, map_contact
+from pipeline.artifacts import ANATOMY, MOVING_BODY, RAW_TABLE, REFERENCE_BODY, SMOOTH_TABLE
+from pipeline.contact_params import ContactParams
+from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage
+from pipeline.errors import CaseRejected
+from pipeline.kinematics.cell import Cell
+from pipeline.kinematics.contact import Bodies, Pose
+from pipeline.kinematics.interpolation import found_at, pose_curves
+from pipeline.kinematics.smoothing import Probe, ends, entries, fit_curves, settle, way_to_contact
+from pipeline.kinematics.sweep import pose_table
+from pipeline.kinematics.table import Float, Grid, PoseTable, SmoothTable, Status
+
+
+class Params(ContactParams):
+    """Degrees of the polynomials and how the result is proven."""
+
+    degree_flexion: int = Field(6, ge=0, le=20, description="degree in flexion (the paper's 6)")
+    degree_varus: int = Field(2, ge=0, le=6, description="degree in varus")
+
+
+def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
+    """Smooth the table and prove it."""
+    raw, anatomy = reads[RAW_TABLE], reads[ANATOMY]
+    try:
+        fits = fit_curves(raw, (params.degree_flexion, params.degree_varus))
+    except ValueError as error:
+        raise CaseRejected(
+            "E-SMO-01", f"The curves cannot be smoothed: {error}.", "Narrow the range of angles or lower the degree."
+        ) from error
+    pair = params.pair(reads[REFERENCE_BODY], reads[MOVING_BODY], anatomy)
+    settled = partial(settle, motion=params.motion(), proof=params.proof())
+    cells = _in_rows(map_contact(settled, entries(raw, fits), pair, out.jobs), raw.grid)
+    poses = pose_table(cells)
+    out[SMOOTH_TABLE] = SmoothTable(
+        grid=raw.grid,
+        poses=poses,
+        fits=fits,
+        flexion_range_deg=ends(raw.grid.flexion_deg),
+        varus_range_deg=ends(raw.grid.varus_deg),
+        contact_error_mm=np.array([[_contact_error(cell) for cell in row] for row in cells]),
+        midpoint_error_mm=_midpoint_errors(raw.grid, poses, partial(way_to_contact, motion=params.motion()), pair, out),
+    )
+    return _findings(poses)
+
+
+def _in_rows(cells: list[Cell], grid: Grid) -> list[list[Cell]]:
+    columns = grid.shape[1]
+    return [cells[k : k + columns] for k in range(0, len(cells), columns)]
+
+
+def _contact_error(cell: Cell) -> float:
+    """Bound of the signed way to contact: + where the entry is clear, - where it has to be pulled back."""
+    return cell.gap_after_mm if cell.gap_before_mm == 0.0 else -cell.gap_before_mm
+
+
+def _midpoint_errors(
+    grid: Grid, poses: PoseTable, way: Callable[[Bodies, Probe], float], pair: ContactPair, out: Outputs
+) -> Float:
+    """(F - 1, V) signed way to contact half-way between entries, as a reader interpolates; NaN where not covered."""
+    flexion = 0.5 * (grid.flexion_deg[1:] + grid.flexion_deg[:-1])
+    angles = np.stack(np.meshgrid(flexion, grid.varus_deg, indexing="ij"), axis=-1)
+    found = found_at(pose_curves(grid, poses), angles[..., 0], angles[..., 1])
+    error = np.full(found.shape[:2], np.nan)
+    covered = np.isfinite(found).all(axis=-1)
+    probes = [_probe(attitude, pose) for attitude, pose in zip(angles[covered], found[covered], strict=True)]
+    error[covered] = map_contact(way, probes, pair, out.jobs)
+    return error
+
+
+def _probe(attitude: Float, found: Float) -> Probe:
+    x, y, z, turn = (float(value) for value in found)
+    return Probe(float(attitude[0]), float(attitude[1]), Pose(x, y, z, float(np.radians(turn))))
+
+
+def _findings(poses: PoseTable) -> Findings:
+    filled = int((poses.status == Status.SMOOTHED).sum())
+    if not filled:
+        return ()
+    message = f"{filled} attitudes without a stable pose were smoothed over from both neighbours in flexion."
+    return (Finding("N-SMO-01", Severity.NOTE, message),)
+
+
+STAGE = Stage(70, "smooth", (ANATOMY, REFERENCE_BODY, MOVING_BODY, RAW_TABLE), (SMOOTH_TABLE,), Params, run)

@@ -1,0 +1,124 @@
+"""Stage 60: a stable pose for every attitude of the grid, by the incremental solver, as found."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from pipeline.adapters.contact_pool import map_contact
+from pipeline.artifacts import ANATOMY, MOVING_BODY, RAW_TABLE, REFERENCE_BODY
+from pipeline.contact_params import ContactParams
+from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage
+from pipeline.errors import CaseRejected
+from pipeline.kinematics.body_frames import scan_pose
+from pipeline.kinematics.incremental import IncrementalSettings
+from pipeline.kinematics.sweep import SweepSettings, arms, assemble, walk
+from pipeline.kinematics.table import Grid, RawTable, Status
+
+MAX_CELLS = 100_000
+
+
+class Params(ContactParams):
+    """The grid, and the paper's steps and resolutions (step = 10 x resolution)."""
+
+    flexion_min_deg: float = Field(0.0, ge=-30, le=170, description="first flexion of the table")
+    flexion_max_deg: float = Field(120.0, ge=-30, le=170, description="last flexion of the table")
+    flexion_step_deg: float = Field(5.0, gt=0, le=90, description="spacing in flexion; divides the range")
+    varus_min_deg: float = Field(-4.0, ge=-30, le=30, description="first varus angle (valgus is negative)")
+    varus_max_deg: float = Field(4.0, ge=-30, le=30, description="last varus angle")
+    varus_step_deg: float = Field(2.0, gt=0, le=30, description="spacing in varus; divides the range")
+    translation_step_mm: float = Field(1.0, gt=0, le=100, description="step of translations")
+    translation_resolution_mm: float = Field(0.1, gt=0, le=5, description="step at which a translation is spent")
+    rotation_step_deg: float = Field(1.0, gt=0, le=45, description="step of rotations about delta")
+    rotation_resolution_deg: float = Field(0.1, gt=0, le=5, description="step at which a rotation is spent")
+    slide_bound_mm: float = Field(30.0, gt=0, le=200, description="farther than this from the scan pose: slid off")
+    rotation_bound_deg: float = Field(45.0, gt=0, le=179, description="farther than this from the scan pose: bound")
+    max_motions: int = Field(400, ge=10, le=100_000, description="motions after which a cell is not converged")
+    classic: bool = Field(default=False, description="the paper's plain rules, without the deeper-only guard")
+
+    @model_validator(mode="after")
+    def _grid_is_whole(self) -> Self:
+        for name in ("flexion", "varus"):
+            low, high, step = (getattr(self, f"{name}_{part}_deg") for part in ("min", "max", "step"))
+            if high < low:
+                raise ValueError(f"{name}_max_deg {high} is below {name}_min_deg {low}")
+            if abs((high - low) / step - round((high - low) / step)) > 1e-9:
+                raise ValueError(f"{name}_step_deg {step} does not divide the range {low} to {high}")
+        if np.prod(self.grid().shape) > MAX_CELLS:
+            raise ValueError(f"the grid has {np.prod(self.grid().shape)} cells, at most {MAX_CELLS}")
+        return self
+
+    def grid(self) -> Grid:
+        """The attitudes of the table."""
+        return Grid(
+            _values(self.flexion_min_deg, self.flexion_max_deg, self.flexion_step_deg),
+            _values(self.varus_min_deg, self.varus_max_deg, self.varus_step_deg),
+        )
+
+
+def _values(low: float, high: float, step: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    return np.linspace(low, high, round((high - low) / step) + 1)
+
+
+def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
+    """Sweep the grid."""
+    anatomy, grid = reads[ANATOMY], params.grid()
+    pair = params.pair(reads[REFERENCE_BODY], reads[MOVING_BODY], anatomy)
+    tasks = arms(grid, anatomy.scan_attitude[0], scan_pose(anatomy.scan_attitude))
+    total, finished = sum(len(task.rows) for task in tasks), 0
+
+    def done(index: int) -> None:
+        nonlocal finished
+        finished += len(tasks[index].rows)
+        out.progress(finished, total)
+
+    work = partial(walk, settings=_settings(params))
+    table = assemble(grid, map_contact(work, tasks, pair, out.jobs, done))
+    if not (table.poses.status == Status.OK).any():
+        raise CaseRejected(
+            "E-SWP-01",
+            f"No stable pose at any of {table.poses.status.size} attitudes: {_counts(table)}.",
+            "Check that cartilage and menisci are labelled, and that the bones are those of one joint.",
+        )
+    out[RAW_TABLE] = table
+    return _findings(table)
+
+
+def _settings(params: Params) -> SweepSettings:
+    solver = IncrementalSettings(
+        translation_step_mm=params.translation_step_mm,
+        translation_resolution_mm=params.translation_resolution_mm,
+        rotation_step_rad=float(np.radians(params.rotation_step_deg)),
+        rotation_resolution_rad=float(np.radians(params.rotation_resolution_deg)),
+        contact_band_mm=params.contact_band_mm,
+        slide_bound_mm=params.slide_bound_mm,
+        rotation_bound_rad=float(np.radians(params.rotation_bound_deg)),
+        max_motions=params.max_motions,
+        classic=params.classic,
+        motion=params.motion(),
+    )
+    return SweepSettings(solver, params.proof())
+
+
+def _counts(table: RawTable) -> str:
+    values, counts = np.unique(table.poses.status, return_counts=True)
+    return ", ".join(f"{count} {Status(int(value)).name.lower()}" for value, count in zip(values, counts, strict=True))
+
+
+def _findings(table: RawTable) -> Findings:
+    note = Finding("N-SWP-01", Severity.NOTE, f"{table.poses.status.size} attitudes: {_counts(table)}.")
+    failed = int((table.poses.status != Status.OK).sum())
+    if not failed:
+        return (note,)
+    review = Finding(
+        "W-SWP-01",
+        Severity.REVIEW,
+        f"{failed} of {table.poses.status.size} attitudes have no stable pose ({_counts(table)}).",
+    )
+    return note, review
+
+
+STAGE = Stage(60, "sweep", (ANATOMY, REFERENCE_BODY, MOVING_BODY), (RAW_TABLE,), Params, run)

@@ -1,0 +1,73 @@
+"""Reads and outputs of a stage held in memory; what is written passes through its encoder and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+from pipeline.artifacts import (
+    ANATOMY,
+    CASE_FACTS,
+    LABELS,
+    MESH_QUALITY,
+    MESHES,
+    MOVING_BODY,
+    RAW_TABLE,
+    REFERENCE_BODY,
+    SMOOTH_TABLE,
+    SURFACE_ORIGINS,
+)
+from pipeline.engine.artifacts import Artifact
+from pipeline.engine.stage import findings_of
+from pipeline.report.evidence import Evidence
+
+T = TypeVar("T")
+
+
+class MemoryReads:
+    """Artifacts by name."""
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self.values = values
+
+    def __getitem__(self, artifact: Artifact[T]) -> T:
+        value: T = self.values[artifact.name]
+        return value
+
+
+class MemoryOutputs:
+    """Encoded artifacts by name."""
+
+    jobs = 1
+
+    def __init__(self) -> None:
+        self.files: dict[str, Mapping[str, bytes]] = {}
+        self.steps: list[tuple[int, int]] = []
+
+    def __setitem__(self, artifact: Artifact[T], value: T) -> None:
+        self.files[artifact.name] = artifact.encode(value)
+
+    def value(self, artifact: Artifact[T]) -> T:
+        """What a later stage would read."""
+        return artifact.decode(self.files[artifact.name])
+
+    def progress(self, done: int, total: int) -> None:
+        """Remember how far the stage says it is."""
+        self.steps.append((done, total))
+
+
+def reads_of(evidence: Evidence) -> MemoryReads:
+    """The artifacts that evidence was gathered from."""
+    values: dict[str, Any] = {
+        CASE_FACTS.name: evidence.facts,
+        LABELS.name: evidence.labels,
+        MESHES.name: evidence.meshes,
+        MESH_QUALITY.name: evidence.mesh_quality,
+        ANATOMY.name: evidence.anatomy,
+        REFERENCE_BODY.name: evidence.reference,
+        MOVING_BODY.name: evidence.moving,
+        SURFACE_ORIGINS.name: evidence.origins,
+        RAW_TABLE.name: evidence.raw,
+        SMOOTH_TABLE.name: evidence.smooth,
+    }
+    return MemoryReads(values | {findings_of(name).name: found for name, found in evidence.findings.items()})

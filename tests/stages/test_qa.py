@@ -1,0 +1,96 @@
+"""The stage as a whole: what it reads and leaves, that it is the same every time, and what it must not load."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.artifacts import REPORT, VERDICT
+from pipeline.engine.stage import Findings, Severity
+from pipeline.kinematics.table import Status
+from pipeline.report import figures
+from pipeline.report.settings import Limits, PictureSettings
+from pipeline.stages.qa import STAGE, Params
+from tests.report.memory import MemoryOutputs, reads_of
+from tests.report.sample import sample_evidence, with_status
+
+SMALL = Params(pictures=PictureSettings(panel_px=150, flexions_deg=[0.0, 90.0]))
+IMAGES = {f"images/{name}.png" for name in ("slices", "bones", "poses", "contact", "curves", "checks")}
+
+
+@pytest.fixture(scope="module")
+def sound() -> tuple[Findings, MemoryOutputs]:
+    """The stage run on a case with nothing wrong."""
+    out = MemoryOutputs()
+    return STAGE.run(reads_of(sample_evidence()), SMALL, out), out
+
+
+def test_a_sound_case_passes_with_all_pictures(sound: tuple[Findings, MemoryOutputs]) -> None:
+    findings, out = sound
+    assert findings == ()
+    assert out.value(VERDICT).word == "PASS"
+    files = out.value(REPORT)
+    assert set(files) == {"report.html", *IMAGES}
+    assert set(out.files) == {artifact.name for artifact in STAGE.writes}
+    assert out.steps[0] == (0, 6)
+    assert out.steps[-1] == (6, 6)
+
+
+def test_the_report_is_small_and_holds_the_same_pictures(sound: tuple[Findings, MemoryOutputs]) -> None:
+    files = sound[1].value(REPORT)
+    assert len(files["report.html"]) < 3_000_000
+    assert files["report.html"].count(b'<img alt="') == len(IMAGES)
+
+
+def test_a_second_run_gives_the_same_bytes(sound: tuple[Findings, MemoryOutputs]) -> None:
+    out = MemoryOutputs()
+    STAGE.run(reads_of(sample_evidence()), SMALL, out)
+    assert out.files == sound[1].files
+
+
+def test_a_broken_guarantee_is_a_review_finding_of_its_number() -> None:
+    evidence = with_status(sample_evidence(), (9, 1), Status.SLID_OFF)
+    contact = np.where(np.arange(39).reshape(13, 3) == 7, 0.05, evidence.smooth.contact_error_mm)
+    out = MemoryOutputs()
+    findings = STAGE.run(
+        reads_of(replace(evidence, smooth=replace(evidence.smooth, contact_error_mm=contact))), SMALL, out
+    )
+    assert [finding.code for finding in findings] == ["W-QA-03", "W-QA-05"]
+    assert {finding.severity for finding in findings} == {Severity.REVIEW}
+    assert out.value(VERDICT).word == "REVIEW"
+    assert out.value(VERDICT).reasons == tuple(finding.message for finding in findings)
+
+
+def test_a_picture_that_cannot_be_drawn_is_missed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> bytes:
+        raise ValueError("nothing to see")
+
+    fine = figures.Drawn(figures.CURVES, b"\x89PNG")
+    monkeypatch.setattr(figures, "SLICES", replace(figures.SLICES, draw=refuse))
+    monkeypatch.setattr(
+        "pipeline.stages.qa.drawn",
+        lambda figure, *rest: figures.drawn(figure, *rest) if figure.name == "slices" else replace(fine, figure=figure),
+    )
+    out = MemoryOutputs()
+    (finding,) = STAGE.run(reads_of(sample_evidence()), SMALL, out)
+    assert finding.code == "W-QA-10"
+    assert finding.message == "The picture 'Labels and surfaces in three planes' is missing: nothing to see."
+    assert b"This picture is missing: nothing to see." in out.value(REPORT)["report.html"]
+    assert "images/slices.png" not in out.value(REPORT)
+
+
+def test_settings_read_as_a_protocol_gives_them() -> None:
+    given = Params.model_validate_json('{"limits": {"max_contact_error_mm": 0.5}, "pictures": {"flexions_deg": [10]}}')
+    assert given.limits == Limits(max_contact_error_mm=0.5)
+    assert given.pictures.flexions_deg == [10.0]
+
+
+def test_a_run_from_the_cache_loads_no_library_that_draws() -> None:
+    heavy = ("vtk", "vtkmodules", "pyvista", "matplotlib", "cv2", "jinja2")
+    code = f"import sys, pipeline.stages.qa; print([n for n in {heavy} if n in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

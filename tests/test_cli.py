@@ -1,0 +1,235 @@
+"""The command line: what is shown, what is returned, and that a mistake leaves nothing behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+from pipeline import __version__, cli, config
+from pipeline.errors import ExitCode
+from tests.toy_flow import TOY_FLOW, write_toy_configs
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def ct2lut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs a command of the toy flow in a folder with one good case, P001; returns code, output, error output."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli, "_flow", lambda: TOY_FLOW)
+    monkeypatch.setattr(config, "CONFIGS", write_toy_configs(tmp_path / "configs"))
+    write_case(tmp_path / "cases" / "P001")
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        code = cli.execute(arguments)
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def write_case(folder: Path, declaration: str = "side: right\n") -> None:
+    folder.mkdir(parents=True)
+    (folder / "labels.txt").write_text("labels")
+    (folder / "case.yaml").write_text(declaration)
+
+
+def listing(folder: Path) -> Sequence[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def test_a_run_from_header_to_verdict(ct2lut: Run) -> None:
+    code, out, err = ct2lut("run", "P001", "--jobs", "1")
+    lines = out.splitlines()
+    assert (code, err) == (ExitCode.PASS, "")
+    assert lines[0] == "P001   right knee   protocol clinical"
+    assert [line.split()[:3] for line in lines[1:3]] == [["[1/2]", "intake", "ok"], ["[2/2]", "qa", "ok"]]
+    assert lines[3:] == ["PASS   P001", "report: results/P001/80_qa/report/report.html"]
+    assert Path("results/P001/80_qa/report/report.html").read_text() == "<p>labels fine</p>"
+
+
+def test_a_second_run_has_nothing_to_do(ct2lut: Run) -> None:
+    ct2lut("run", "P001")
+    code, out, _ = ct2lut("run", "P001")
+    assert code == ExitCode.PASS
+    assert "PASS   P001   nothing to do: all 2 stages are up to date" in out
+
+
+def test_a_review_names_at_most_three_reasons(ct2lut: Run) -> None:
+    code, out, _ = ct2lut("run", "P001", "--set", "qa.review=true", "--set", "qa.count=5")
+    lines = out.splitlines()
+    verdict = lines.index("REVIEW   P001")
+    assert code == ExitCode.REVIEW
+    assert lines[verdict + 1 : verdict + 5] == ["  W-TOY-01  Look at the toy."] * 3 + ["  and 2 more in the report"]
+
+
+def test_a_rejected_case_says_what_to_do(ct2lut: Run) -> None:
+    write_case(Path("cases/P002"), "{}")
+    code, out, _ = ct2lut("run", "P002")
+    assert code == ExitCode.REJECTED
+    verdict = out[out.index("REJECTED") :].splitlines()
+    expected = [
+        "REJECTED   P002   E-SIDE-01",
+        "  The side is not given.",
+        "  Add side: right or side: left to case.yaml.",
+    ]
+    assert verdict == expected
+
+
+def test_a_wrong_declaration_is_the_fault_of_the_case(ct2lut: Run) -> None:
+    write_case(Path("cases/P002"), "side: both")
+    code, _, err = ct2lut("run", "P002")
+    assert code == ExitCode.REJECTED
+    assert err.startswith("E-CASE-03  case.yaml: side is 'both'; expected right or left.\n")
+
+
+def test_a_missing_case_is_rejected(ct2lut: Run) -> None:
+    code, out, _ = ct2lut("run", "P404")
+    assert code == ExitCode.REJECTED
+    assert "REJECTED   P404   E-IO-03" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["run", "P001", "--set", "qa.wrod=x"], "E-CFG-01"),
+        (["run", "P001", "--set", "qa.count=99"], "E-CFG-02"),
+        (["run", "P001", "--protocol", "clinicl"], "E-CFG-03"),
+        (["run", "../P001"], "E-ID-01"),
+        (["plan", "../P001"], "E-ID-01"),
+        (["report", "../P001"], "E-ID-01"),
+        (["verify", "../P001"], "E-ID-01"),
+        (["status", "../P001"], "E-ID-01"),
+        (["lookup", "../P001", "--flexion", "0"], "E-ID-01"),
+        (["phantom", "cases", "--id", "../P001"], "E-ID-01"),
+        (["phantom", "cases", "--id", "P001"], "E-PHA-01"),
+        (
+            ["phantom", "cases", "--set", "sied=left"],
+            "E-PHA-02  The phantom has no number 'sied' (did you mean 'side'?).",
+        ),
+        (["phantom", "cases", "--set", "scale=9"], "E-PHA-03"),
+        (["phantom", "cases", "--set", "side=both"], "E-PHA-03"),
+        (["run", "p001"], "E-ID-02"),
+        (["lookup", "P001", "--flexion", "0"], "E-LUT-01"),
+        (["run"], "E-USE-01"),
+        (["run", "P001", "--job", "1"], "E-USE-01"),
+        (["run", "P001", "--jobs", "-1"], "E-USE-01"),
+        (["runn", "P001"], "E-USE-01"),
+    ],
+)
+def test_usage_errors_do_nothing(ct2lut: Run, arguments: list[str], message: str) -> None:
+    before = listing(Path())
+    code, out, err = ct2lut(*arguments)
+    assert (code, out) == (ExitCode.USAGE, "")
+    assert err.startswith(message)
+    assert len(err.splitlines()) == 2
+    assert listing(Path()) == before
+
+
+def test_plan_says_why_and_writes_nothing(ct2lut: Run) -> None:
+    before = listing(Path())
+    code, out, _ = ct2lut("plan", "P001")
+    assert code == ExitCode.PASS
+    assert [line.split()[:2] for line in out.splitlines()] == [["intake", "run"], ["qa", "run"]]
+    assert listing(Path()) == before
+    ct2lut("run", "P001")
+    assert ct2lut("plan", "P001")[1] == "nothing to do: all 2 stages are up to date\n"
+    planned = ct2lut("plan", "P001", "--set", "qa.word=other")[1].splitlines()
+    assert planned[0].split()[:2] == ["intake", "skip"]
+    assert planned[1].split()[:2] == ["qa", "run"]
+    assert "word" in planned[1]
+
+
+def test_status_of_one_and_of_all(ct2lut: Run) -> None:
+    assert ct2lut("status") == (0, "no results in results\n", "")
+    ct2lut("run", "P001", "--set", "qa.review=true")
+    one = ct2lut("status", "P001")[1].splitlines()
+    assert one[0].split()[:3] == ["10", "intake", "done"]
+    assert one[1].endswith("W-TOY-01 W-TOY-01 W-TOY-01")
+    assert one[2] == "last run: REVIEW"
+    every = ct2lut("status")[1]
+    assert every.split()[:3] == ["P001", "2/2", "stages"]
+
+
+def test_verify_finds_a_changed_file(ct2lut: Run) -> None:
+    ct2lut("run", "P001")
+    assert ct2lut("verify", "P001")[0] == ExitCode.PASS
+    page = Path("results/P001/80_qa/report/report.html")
+    page.chmod(0o640)
+    page.write_text("other")
+    code, out, _ = ct2lut("verify", "P001")
+    assert code == ExitCode.ENVIRONMENT
+    assert "report.html" in out
+
+
+def test_report_shows_the_page(ct2lut: Run) -> None:
+    code, out, _ = ct2lut("report", "P001")
+    assert code == ExitCode.PASS
+    assert out.splitlines()[-1] == "report: results/P001/80_qa/report/report.html"
+
+
+def test_a_bug_is_one_line(ct2lut: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cli, "_flow", lambda: 1 / 0)
+    code, _, err = ct2lut("plan", "P001")
+    assert code == ExitCode.ERROR
+    assert err.startswith("E-BUG-01  The program failed: ZeroDivisionError")
+    assert "Traceback" not in err
+
+
+def test_version_and_help(ct2lut: Run) -> None:
+    assert ct2lut("--version") == (0, f"ct2lut {__version__}\n", "")
+    code, out, _ = ct2lut()
+    assert code == 0
+    assert "Research" in out
+    assert all(command in out for command in ("run", "plan", "status", "verify", "report", "lookup", "phantom"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_stops_cleanly(tmp_path: Path, number: signal.Signals) -> None:
+    write_case(tmp_path / "cases" / "P001")
+    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
+    with subprocess.Popen(
+        [sys.executable, "-m", "tests.waiting_program", "run", "P001"],
+        cwd=tmp_path,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        assert "waiting\n" in iter(process.stdout.readline, "")
+        started = time.monotonic()
+        process.send_signal(number)
+        _, err = process.communicate(timeout=20)
+    assert time.monotonic() - started < 5
+    assert process.returncode == ExitCode.INTERRUPTED
+    assert err.splitlines() == ["Interrupted.", "The same command goes on where this one stopped."]
+    assert not [name for name in listing(tmp_path / "results" / "P001") if "intake" in name]
+
+
+HEAVY = (
+    "vtk",
+    "vtkmodules",
+    "pyvista",
+    "matplotlib",
+    "scipy",
+    "trimesh",
+    "fcl",
+    "cv2",
+    "SimpleITK",
+    "meshio",
+    "jinja2",
+)
+
+
+def test_commands_load_no_heavy_library() -> None:
+    check = f"import sys; import pipeline.cli, pipeline.flow; print(*sorted(set({HEAVY!r}) & set(sys.modules)))"
+    answer = subprocess.run([sys.executable, "-c", check], cwd=CHECKOUT, capture_output=True, text=True, check=True)
+    assert answer.stdout.split() == []

@@ -1,0 +1,188 @@
+"""Write the reference pages from the code, so that they cannot say anything else than the program does.
+
+python -m tools.reference docs
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import typer.main
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from pipeline.cli import EXIT_CODES, app
+from pipeline.flow import FLOW
+
+CODE = re.compile(r"[ENW]-[A-Z]+-\d\d")
+BOUNDS = {
+    "gt": "above {}",
+    "ge": "at least {}",
+    "lt": "below {}",
+    "le": "at most {}",
+    "multiple_of": "a multiple of {}",
+}
+NOTE = "<!-- written by `make docs` from the code; do not edit -->"
+
+
+#: Codes whose wording is put together while the program runs.
+SUMMARIES = {
+    "E-CFG-01": "A stage or setting of that name does not exist (protocol, joint file or `--set`).",
+    "E-CFG-02": "A setting has a value that it cannot have (protocol, joint file or `--set`).",
+    "E-GEO-06": "The voxel size of … is outside the range for which results are trusted.",
+    "E-BUG-01": "The program failed: … Please report this line and the command you typed.",
+    "E-USE-01": "The command or one of its options is not known, or something is missing.",
+}
+
+
+def pages() -> dict[str, str]:
+    """File name -> text of every reference page."""
+    return {"commands.md": commands_page(), "settings.md": settings_page(), "messages.md": messages_page()}
+
+
+def commands_page() -> str:
+    """Every command of the program with its options."""
+    lines = [NOTE, "", "# Commands", "", EXIT_CODES.replace("\n", " "), ""]
+    group: Any = typer.main.get_command(app)
+    for name, command in group.commands.items():
+        lines += [f"## ct2lut {name}", "", _plain(command.help), "", *_table("option", "default", "meaning")]
+        lines += [_row(_spelling(option), _default(option), option.help) for option in command.params]
+        lines.append("")
+    return _page(lines)
+
+
+def settings_page() -> str:
+    """Every setting of every stage with its default, limits and meaning."""
+    lines = [NOTE, "", "# Settings", ""]
+    lines += ["Written in a protocol or in `settings:` of `case.yaml` as", ""]
+    lines += ["    stage:", "      setting: value", "", "or on the command line as `--set stage.setting=value`.", ""]
+    for stage in FLOW:
+        lines += [
+            f"## {stage.name}",
+            "",
+            *_table("setting", "default", "limits", "meaning"),
+            *_settings(stage.Params),
+            "",
+        ]
+    return _page(lines)
+
+
+def messages_page() -> str:
+    """Every code that a message can carry, with its wording; `…` stands for what differs from case to case."""
+    wording: dict[str, set[str]] = defaultdict(set)
+    for path in sorted((Path(__file__).parents[1] / "pipeline").rglob("*.py")):
+        for code, text in _messages(ast.parse(path.read_text())):
+            wording[code].add(text or SUMMARIES.get(code, ""))
+    lines = [NOTE, "", "# Messages", ""]
+    lines += [
+        "E: stopped. W: look before you use the result. N: a note. `…` stands for what differs from case to case.",
+        "",
+    ]
+    lines += _table("code", "wording")
+    lines += [_row(code, "<br>".join(sorted(text for text in wording[code] if text))) for code in sorted(wording)]
+    return _page(lines)
+
+
+def _page(lines: list[str]) -> str:
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _table(*titles: str) -> list[str]:
+    return [_row(*titles), _row(*("---" for _ in titles))]
+
+
+def _row(*cells: object) -> str:
+    return "| " + " | ".join(_plain(str(cell)).replace("|", "\\|") for cell in cells) + " |"
+
+
+def _plain(text: str | None) -> str:
+    return " ".join((text or "").split())
+
+
+def _spelling(option: Any) -> str:
+    names = option.opts if option.param_type_name == "option" else [option.metavar]
+    return " ".join(f"`{name}`" for name in names)
+
+
+def _default(option: Any) -> str:
+    return "" if option.required or option.default is None else f"`{option.default}`"
+
+
+def _settings(model: type[BaseModel], prefix: str = "") -> list[str]:
+    rows = []
+    for name, described in model.model_fields.items():
+        nested = _nested(described.annotation)
+        if nested is not None and isinstance(described.annotation, type):
+            rows += _settings(nested, f"{prefix}{name}.")
+        else:
+            rows.append(_row(f"`{prefix}{name}`", _given(described), _limits(described), described.description or ""))
+    return rows
+
+
+def _nested(annotation: Any) -> type[BaseModel] | None:
+    return annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None
+
+
+def _given(described: FieldInfo) -> str:
+    default = described.get_default(call_default_factory=True)
+    return "required" if default is PydanticUndefined else f"`{default}`"
+
+
+def _limits(described: FieldInfo) -> str:
+    words = [
+        words.format(f"{getattr(bound, key):g}")
+        for bound in described.metadata
+        for key, words in BOUNDS.items()
+        if getattr(bound, key, None) is not None
+    ]
+    choices = [str(choice) for choice in get_args(described.annotation) if isinstance(choice, str)]
+    return ", ".join(words or choices)
+
+
+def _messages(tree: ast.Module) -> Iterator[tuple[str, str]]:
+    constants = [node for node in tree.body if isinstance(node, ast.Assign)]
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    for scope in (*constants, *functions):
+        assigned = [node for node in ast.walk(scope) if isinstance(node, ast.Assign)]
+        for call in (node for node in ast.walk(scope) if isinstance(node, ast.Call)):
+            yield from _message(call, [node for node in assigned if node.lineno < call.lineno])
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and CODE.fullmatch(node.value):
+            yield node.value, ""
+
+
+def _message(call: ast.Call, assigned: list[ast.Assign]) -> Iterator[tuple[str, str]]:
+    """The texts beside a code in a call; a name stands for what was last assigned to it above the call."""
+    values = [*call.args, *(keyword.value for keyword in call.keywords)]
+    codes = [value.value for value in values if isinstance(value, ast.Constant) and CODE.fullmatch(str(value.value))]
+    local = {node.targets[0].id: node.value for node in assigned if isinstance(node.targets[0], ast.Name)}
+    texts = [_template(local.get(value.id, value) if isinstance(value, ast.Name) else value) for value in values]
+    for code in codes:
+        yield str(code), " ".join(text for text in texts if " " in text)
+
+
+def _template(value: ast.expr) -> str:
+    if isinstance(value, ast.Constant):
+        return str(value.value) if isinstance(value.value, str) else ""
+    if isinstance(value, ast.JoinedStr):
+        return "".join(_template(part) for part in value.values)
+    if isinstance(value, ast.BinOp):
+        return _template(value.left) + _template(value.right)
+    return "…" if isinstance(value, ast.FormattedValue) else ""
+
+
+def main() -> None:
+    """Write the pages into the folder that is given."""
+    for name, text in pages().items():
+        (Path(sys.argv[1]) / name).write_text(text)
+
+
+if __name__ == "__main__":
+    main()
