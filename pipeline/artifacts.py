@@ -6,7 +6,7 @@ from pipeline.engine.artifacts import folder
 from pipeline.engine.records import record_artifact
 from pipeline.files.arrays import array_artifact, label_volume_artifact, mesh_artifact, mesh_set_artifact
 from pipeline.kinematics.table import RawTable, SmoothTable
-from pipeline.records import Anatomy, CaseFacts, MeshQuality, SurfaceOrigin, Verdict
+from pipeline.records import Anatomy, CaseFacts, MeshQuality, ScanReturn, SurfaceOrigin, Verdict
 
 # 10_intake
 CASE_FACTS = record_artifact("case_facts", "case.json", CaseFacts)
@@ -27,6 +27,7 @@ SURFACE_ORIGINS = record_artifact("surface_origins", "surface_origins.json", tup
 
 # 60_sweep
 RAW_TABLE = array_artifact("raw_table", "raw_table.npz", RawTable)
+SCAN_RETURNS = record_artifact("scan_returns", "scan_returns.json", tuple[ScanReturn, ...])
 
 # 70_smooth
 SMOOTH_TABLE = array_artifact("smooth_table", "smooth_table.npz", SmoothTable)

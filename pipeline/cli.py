@@ -65,6 +65,9 @@ def execute(arguments: Sequence[str]) -> int:
         return _complain(f"{error.code}  {error.problem}", error.action, error.exit_code)
     except typer.TyperException as error:
         return _complain(f"E-USE-01  {error.format_message()}", "ct2lut --help lists the commands.", ExitCode.USAGE)
+    except OSError as error:
+        problem = f"E-ENV-20  The operating system refused: {error.strerror or type(error).__name__}."
+        return _complain(problem, "Check the folders you named, their permissions and the disk.", ExitCode.ENVIRONMENT)
     except Exception as error:  # noqa: BLE001 -- the last line of defence: a bug is told in one line
         place = traceback.extract_tb(error.__traceback__)[-1]
         problem = f"E-BUG-01  The program failed: {type(error).__name__} in {place.name}, line {place.lineno}."
@@ -224,15 +227,11 @@ def phantom(
 
     Example: ct2lut phantom cases --id demo --set side=left --set spacing_mm=[1,1,1]
     """
+    from pipeline.files.phantom_case import write_phantom_case
     from pipeline.request import phantom_spec
 
     place = folder / check_case_id(case_id)
-    if place.exists():
-        raise ConfigError("E-PHA-01", f"The case {case_id} is there already.", "Choose another --id, or remove it.")
-    spec = phantom_spec(numbers or ())
-    from pipeline.files.phantom_case import write_phantom_case
-
-    write_phantom_case(place, spec)
+    write_phantom_case(place, phantom_spec(numbers or ()))
     _say(f"made the case {place}")
 
 

@@ -135,6 +135,31 @@ class SurfaceOrigin:
 
 
 @dataclass(frozen=True)
+class ScanReturn:
+    """Let go near the scan's own pose, at the scan's attitude: how far from it the body came to rest.
+
+    Attributes
+    ----------
+    start_lateral_mm, start_anterior_mm, start_rotation_deg : float
+        Where it was let go, relative to the scan pose.
+    settled : bool
+        Whether a stable pose was found; the differences are 0 where not.
+    shift_mm, rotation_deg : float
+        Length of the difference of (x, y), and of the rotation.
+    sinking_mm : float
+        How far along delta it came to rest beyond the scan pose: the play that the scan left (negative: overlap).
+    """
+
+    start_lateral_mm: float
+    start_anterior_mm: float
+    start_rotation_deg: float
+    settled: bool
+    shift_mm: float
+    rotation_deg: float
+    sinking_mm: float
+
+
+@dataclass(frozen=True)
 class Metric:
     """One number of the verdict.
 

@@ -183,6 +183,24 @@ def test_a_bug_is_one_line(ct2lut: Run, monkeypatch: pytest.MonkeyPatch) -> None
     assert "Traceback" not in err
 
 
+def test_a_refusing_system_is_not_a_bug(ct2lut: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse() -> None:
+        raise PermissionError(13, "Permission denied", "/secret/place")
+
+    monkeypatch.setattr(cli, "_flow", refuse)
+    code, _, err = ct2lut("plan", "P001")
+    assert code == ExitCode.ENVIRONMENT
+    assert err.startswith("E-ENV-20  The operating system refused: Permission denied.\n")
+    assert "secret" not in err
+
+
+def test_a_phantom_is_a_case(ct2lut: Run) -> None:
+    code, out, _ = ct2lut("phantom", "cases", "--id", "toy", "--set", "side=left", "--set", "spacing_mm=[4,4,4]")
+    assert (code, out) == (ExitCode.PASS, "made the case cases/toy\n")
+    assert "side: left" in Path("cases/toy/case.yaml").read_text()
+    assert Path("cases/toy/labels.nrrd").stat().st_size > 0
+
+
 def test_version_and_help(ct2lut: Run) -> None:
     assert ct2lut("--version") == (0, f"ct2lut {__version__}\n", "")
     code, out, _ = ct2lut()

@@ -38,6 +38,7 @@ SUMMARIES = {
     "E-CFG-02": "A setting has a value that it cannot have (protocol, joint file or `--set`).",
     "E-GEO-06": "The voxel size of … is outside the range for which results are trusted.",
     "E-BUG-01": "The program failed: … Please report this line and the command you typed.",
+    "E-ENV-20": "The operating system refused: … Check the folders you named, their permissions and the disk.",
     "E-USE-01": "The command or one of its options is not known, or something is missing.",
 }
 

@@ -70,11 +70,12 @@ def draw_text(image: Image, text: Text, at: tuple[float, float], align: float = 
 
 
 def draw_tag(image: Image, text: Text, at: tuple[float, float], align: float = 0.0) -> None:
-    """Like :func:`draw_text` on a pale plate, readable on anything."""
+    """Like :func:`draw_text` on a plate, pale under dark letters and dark under pale ones: readable on anything."""
     width, x = text_width(text), at[0] - align * text_width(text)
     top, bottom = max(0, round(at[1] - 0.95 * text.size_px)), max(0, round(at[1] + 0.3 * text.size_px))
     plate = image[top:bottom, max(0, round(x) - 3) : max(0, round(x) + width + 4)]
-    plate[:] = (0.2 * plate + 0.8 * 255).astype(np.uint8)
+    shade = 255 if sum(text.color) < 384 else 20
+    plate[:] = (0.2 * plate + 0.8 * shade).astype(np.uint8)
     draw_text(image, text, (x, at[1]))
 
 

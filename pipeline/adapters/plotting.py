@@ -25,7 +25,7 @@ MIN_SPAN = 0.2
 _LOOKS: dict[str, dict[str, object]] = {
     "line": {"linestyle": "-", "linewidth": 1.8},
     "dashed": {"linestyle": "--", "linewidth": 1.4},
-    "dots": {"linestyle": "none", "marker": "o", "markersize": 2.6, "alpha": 0.65, "markeredgewidth": 0.0},
+    "dots": {"linestyle": "none", "marker": "o", "markersize": 3.4, "alpha": 0.65, "markeredgewidth": 0.0},
     "cross": {"linestyle": "none", "marker": "x", "markersize": 6.0, "markeredgewidth": 1.6, "clip_on": False},
     "star": {"linestyle": "none", "marker": "*", "markersize": 13.0, "markeredgecolor": "white"},
     "bar": {"linestyle": "-", "linewidth": 7.0, "alpha": 0.35, "solid_capstyle": "butt"},

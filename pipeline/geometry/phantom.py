@@ -219,8 +219,8 @@ class PhantomTruth:
     scan_attitude : (6,) float64
         Flexion, varus, internal rotation (deg), lateral, anterior, proximal (mm) of the scan.
     seat_attitude : (6,) float64
-        The same of the stable pose at the scan's varus; it holds for every flexion from 0 on, but for the first
-        number. Exact without roughness.
+        The same of the stable pose at the scan's varus; but for the first number it holds for every flexion from
+        0 to 120 deg. Exact without roughness.
     flexion_axis : (3,) float64
         Unit vector from medial to lateral.
     femoral_shaft_axis, tibial_shaft_axis : (3,) float64

@@ -62,7 +62,7 @@ def femur_field(points: Float, spec: PhantomSpec) -> Float:
     whole = _metaphysis(points, spec)
     low = points[2] < _DISTAL_TOP_MM
     whole[low] = _with_distal_part(points[:, low], whole[low], spec)
-    return whole + unevenness(spec.roughness_mm, spec.seed).at(points)
+    return unevenness(spec.roughness_mm, spec.seed, 0).added_to(whole, points)
 
 
 def _with_distal_part(points: Float, metaphysis: Float, spec: PhantomSpec) -> Float:

@@ -139,20 +139,20 @@ class Unevenness:
     phases: Float
     amplitude_mm: float
 
-    def at(self, points: Float) -> Float:
-        """Value (N,) at points (3, N); zero without any evaluation where the amplitude is zero."""
-        if self.amplitude_mm == 0.0:
-            return np.zeros(points.shape[1])
-        total = np.zeros(points.shape[1])
-        for wave, phase in zip(self.waves_per_mm, self.phases, strict=True):
-            total += np.cos(wave @ points + phase)
-        return np.asarray(self.amplitude_mm * total)
+    def added_to(self, field: Float, points: Float) -> Float:
+        """A solid's field (N,) with the unevenness on its surface; it is left as it is where that is out of reach."""
+        near = np.abs(field) < self.amplitude_mm * len(self.phases)
+        out = field.copy()
+        at = points[:, near]
+        for (x, y, z), phase in zip(self.waves_per_mm, self.phases, strict=True):
+            out[near] += self.amplitude_mm * np.cos(x * at[0] + y * at[1] + z * at[2] + phase)
+        return out
 
 
-def unevenness(rms_mm: float, seed: int) -> Unevenness:
-    """A random field of the given RMS with wavelengths of 8 to 25 mm in random directions."""
+def unevenness(rms_mm: float, seed: int, part: int) -> Unevenness:
+    """A random field of the given RMS, wavelengths of 8 to 25 mm in random directions; another for each part."""
     count = 24
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng((seed, part))
     direction = random.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     waves = direction * (2 * np.pi / random.uniform(8.0, 25.0, size=(count, 1)))

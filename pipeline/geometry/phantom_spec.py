@@ -24,7 +24,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "tibial_shaft_radius_mm": (9.0, 15.0),
     "shaft_length_mm": (5.0, 200.0),
     "clearance_mm": (0.0, 0.5),
-    "seat_play_mm": (0.5, 3.0),
+    "seat_play_mm": (0.0, 3.0),
     "roughness_mm": (0.0, 1.0),
     "flexion_deg": (0.0, 30.0),
     "varus_deg": (-5.0, 5.0),
@@ -72,7 +72,8 @@ class PhantomSpec:
     clearance_mm : float
         Gap between the femoral cartilage and its seat in the scan, measured at the deepest points along the push.
     seat_play_mm : float
-        The radii of the seat are larger than those of the condyles by this: a shift of d costs d^2 / (2 play).
+        The radii of the seat exceed those of the condyles by the clearance and this. The looser the seat, the less
+        it holds the rotation when one compartment is lifted: a shift of d costs d^2 / (2 (clearance + play)).
     roughness_mm : float
         RMS of a smooth random unevenness (wavelengths 8 to 25 mm) of the bones and of the seat.
     seed : int
@@ -87,7 +88,8 @@ class PhantomSpec:
         Rigid placement of the whole scan in the patient space (LPS): turned about x, then y, then z, then shifted.
         It changes the header, never a voxel.
     grid_tilt_deg : (x, y, z)
-        Turn of the voxel axes against the knee, so that the scan is oblique to the anatomy.
+        Turn of the voxel axes against the knee. A knee is never square to its scan; if it is, the voxels' terraces
+        fall on the contacts.
 
     Raises
     ------
@@ -101,7 +103,7 @@ class PhantomSpec:
     condyle_width_mm: float = 25.0
     medial_radius_mm: float = 22.0
     lateral_radius_mm: float = 20.5
-    distal_radius_excess_mm: float = 10.0
+    distal_radius_excess_mm: float = 8.0
     crown_mm: float = 10.0
     cartilage_mm: float = 2.2
     meniscus_height_mm: float = 6.0
@@ -111,7 +113,7 @@ class PhantomSpec:
     tibial_shaft_radius_mm: float = 12.0
     shaft_length_mm: float = 60.0
     clearance_mm: float = 0.1
-    seat_play_mm: float = 0.6
+    seat_play_mm: float = 0.1
     roughness_mm: float = 0.0
     seed: int = 0
     flexion_deg: float = 8.0
@@ -121,7 +123,7 @@ class PhantomSpec:
     margin_mm: float = 5.0
     placement_deg: Vector = (0.0, 0.0, 0.0)
     placement_mm: Vector = (0.0, 0.0, 0.0)
-    grid_tilt_deg: Vector = (0.0, 0.0, 0.0)
+    grid_tilt_deg: Vector = (6.0, 12.0, 9.0)
 
     def __post_init__(self) -> None:
         if self.side not in ("right", "left"):

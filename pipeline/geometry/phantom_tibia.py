@@ -1,7 +1,7 @@
 """The tibial side of the phantom: tibia, cartilage, menisci, fibula. Points in the moving frame, right knee, mm.
 
-The seat (menisci and the middle of each plateau) is moulded to the femoral condyles at full extension, with radii
-larger by the play. Behind the contact of full extension the condyles are surfaces of revolution about the flexion axis,
+The seat (menisci and the middle of each plateau) is moulded to the femoral condyles at full extension, with slightly
+larger radii. Behind the contact of full extension the condyles are surfaces of revolution about the flexion axis,
 and the larger distal radius moves forwards and upwards as the knee flexes: the condyles never leave the mould. Hence
 the knee has one seat for every flexion: pushed on by the clearance along z, both condyles touch at their deepest points
 and the knee is stable at the other coordinates of the scan.
@@ -115,12 +115,12 @@ def _contact_mm(middle_mm: float, reach_mm: float, pose: KneePose) -> Float:
 
 
 def mould_field(points: Float, tibia: Tibia) -> Float:
-    """Field (N,) of what is cut out to make the seat: the condyles grown by the play, lifted back to the clearance."""
+    """Field (N,) of what is cut out to make the seat: the condyles grown, lifted by the play."""
     spec = tibia.spec
-    lift = np.array([[0.0], [0.0], [spec.seat_play_mm - spec.clearance_mm]])
+    lift = np.array([[0.0], [0.0], [spec.seat_play_mm]])
     in_reference = moved(reference_from_moving(tibia.mould), points - lift)
-    grown = condyles_field(in_reference, condyles_of(spec)) - spec.seat_play_mm
-    return grown - unevenness(spec.roughness_mm, spec.seed + 1).at(points)
+    grown = condyles_field(in_reference, condyles_of(spec)) - spec.clearance_mm - spec.seat_play_mm
+    return unevenness(spec.roughness_mm, spec.seed, 1).added_to(grown, points)
 
 
 def in_the_way(points: Float, tibia: Tibia) -> Bools:
@@ -181,7 +181,7 @@ def tibia_field(points: Float, tibia: Tibia) -> Float:
     high = points[2] > -METAPHYSIS_BOTTOM_MM
     near = points[:, high]
     whole[high] = intersection(_metaphysis(near, tibia), near[2] - plateau_height_mm(near, tibia), 1.5)
-    return np.asarray(whole + unevenness(tibia.spec.roughness_mm, tibia.spec.seed + 2).at(points))
+    return unevenness(tibia.spec.roughness_mm, tibia.spec.seed, 2).added_to(whole, points)
 
 
 def _metaphysis(points: Float, tibia: Tibia) -> Float:

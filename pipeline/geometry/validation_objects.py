@@ -53,12 +53,12 @@ class ValidationPair:
     @property
     def reference_body(self) -> TriangleMesh:
         """All reference structures as one mesh, in the reference's kinematic frame."""
-        return _placed(_joined(tuple(self.reference.values())), np.linalg.inv(self.scan_from_reference))
+        return _in_frame(_joined(tuple(self.reference.values())), self.scan_from_reference)
 
     @property
     def moving_body(self) -> TriangleMesh:
         """All moving structures as one mesh, in the moving body's kinematic frame."""
-        return _placed(_joined(tuple(self.moving.values())), np.linalg.inv(self.scan_from_moving))
+        return _in_frame(_joined(tuple(self.moving.values())), self.scan_from_moving)
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ class BarOnPyramids:
         return self.half_length_mm - self.half_base_mm * (1.0 - self.rest_height_mm / self.height_mm)
 
     def standing_height_mm(self, sideways_mm: float, turn_rad: float) -> float:
-        """s(u, psi): height of the lower face at first contact; holds while the contacts lie within the bar's length."""
+        """s(u, psi): height of the lower face at first contact, where the contacts lie within the bar's length."""
         cosine, sine = np.cos(turn_rad), abs(np.sin(turn_rad))
         reach = self.half_width_mm + abs(sideways_mm) - self.half_gap_mm * cosine + self.half_base_mm * sine
         return float(reach / (self.lean * cosine + self.half_base_mm / self.height_mm * sine))
@@ -155,7 +155,8 @@ class BarOnPyramids:
         """The two bodies with their answer."""
         cosine, sine = self.turn
         turned = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-        upright = box((-self.half_width_mm, self.half_width_mm), (-self.half_length_mm, self.half_length_mm), (0.0, self.thickness_mm))
+        width, length = self.half_width_mm, self.half_length_mm
+        upright = box((-width, width), (-length, length), (0.0, self.thickness_mm))
         bar = TriangleMesh(upright.points @ turned.T + self.let_go_mm, upright.triangles)
         return ValidationPair(
             reference={"left_pyramid": self._pyramid(-1.0), "right_pyramid": self._pyramid(1.0)},
@@ -226,7 +227,7 @@ def revolved(profile: Float, sectors: int) -> TriangleMesh:
 
 
 def _ring_triangles(rings: int, sectors: int) -> NDArray[np.int32]:
-    """Triangles of stacked rings (ring by ring, each counter-clockwise from above) closed by a first and a last pole."""
+    """Triangles of stacked rings (each counter-clockwise from above), closed by a first and a last pole."""
     first, last = rings * sectors, rings * sectors + 1
     here = np.arange(sectors)
     beside = np.roll(here, -1)
@@ -240,7 +241,7 @@ def _ring_triangles(rings: int, sectors: int) -> NDArray[np.int32]:
 
 
 def _graded_angles(end_rad: float, first_rad: float) -> Float:
-    """(N,) polar angles of the rings: the spacing grows by an eighth from ring to ring up to 0.1 rad; ends at the end."""
+    """(N,) polar angles of the rings up to the end: the spacing grows by an eighth from ring to ring, to 0.1 rad."""
     spacing = np.minimum(first_rad * 1.125 ** np.arange(200.0), 0.1)
     angles = np.cumsum(spacing)
     return np.append(angles[angles < end_rad - 0.5 * 0.1], end_rad)
@@ -252,8 +253,9 @@ def _joined(meshes: tuple[TriangleMesh, ...]) -> TriangleMesh:
     return TriangleMesh(np.vstack([mesh.points for mesh in meshes]), np.vstack(triangles).astype(np.int32))
 
 
-def _placed(mesh: TriangleMesh, transform: Float) -> TriangleMesh:
-    return TriangleMesh(mesh.points @ transform[:3, :3].T + transform[:3, 3], mesh.triangles)
+def _in_frame(mesh: TriangleMesh, scan_from_frame: Float) -> TriangleMesh:
+    """A mesh of scan space in a right-handed frame."""
+    return TriangleMesh((mesh.points - scan_from_frame[:3, 3]) @ scan_from_frame[:3, :3], mesh.triangles)
 
 
 def _shifted(mesh: TriangleMesh, shift: Float) -> TriangleMesh:

@@ -8,13 +8,14 @@ stands still, the moving body turns about z and shifts. The exact triangle test 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.mesh import TriangleMesh
-from pipeline.geometry.triangles import near_features
+from pipeline.geometry.triangles import near_features, with_neighbours
 from pipeline.kinematics.joint_coordinates import Float, attitude_rotation, rotation_z
 
 #: A wall whose normal is nearly orthogonal to delta carries no load along it; below this cosine it counts as this
@@ -110,8 +111,8 @@ class AttitudeContact:
         pairs = self._candidates(pose, band_mm)
         rotation, shift = self._placement(pose)
         reference, moving = self.bodies.reference, self.bodies.moving
-        first = reference.points[reference.triangles[pairs[:, 0]]]
-        second = moving.points[moving.triangles[pairs[:, 1]]] @ rotation.T + shift
+        first = reference.points[_patches(reference)[pairs[:, 0]]]
+        second = moving.points[_patches(moving)[pairs[:, 1]]] @ rotation.T + shift
         near = near_features(first, second, band_mm)
         normals = (near.on_second - near.on_first) / near.distance[:, None]
         keep = _distinct(near.on_first, normals, near.distance)
@@ -125,6 +126,12 @@ class AttitudeContact:
     def _placement(self, pose: Pose) -> tuple[Float, Float]:
         to_reference = self._reference_from_attitude
         return to_reference @ rotation_z(pose.theta), to_reference @ np.array([pose.x, pose.y, pose.z])
+
+
+@lru_cache(maxsize=8)
+def _patches(mesh: TriangleMesh) -> NDArray[np.int32]:
+    """(M, 6) each triangle with its neighbours; the same for every attitude, so worked out once for a mesh."""
+    return with_neighbours(mesh.triangles)
 
 
 def _pushes(pose: Pose, band_mm: float) -> list[Pose]:

@@ -42,12 +42,15 @@ import numpy as np
 from pipeline.kinematics.contact import AttitudeContact, Contacts, Pose, reaction_rates, reaction_slack
 from pipeline.kinematics.descent import MotionSettings, drop, move_until_contact
 from pipeline.kinematics.joint_coordinates import Float
-from pipeline.kinematics.least_rate import LEAST_PROMISE, best_motion
+from pipeline.kinematics.least_rate import best_motion
 from pipeline.kinematics.table import Status
 
 Kind = Literal["rotation", "translation"]
 Motion = tuple[float, float, float]
 KINDS: tuple[Kind, ...] = ("rotation", "translation")
+
+#: Advance along delta per unit of motion below which contacts promise nothing (rounding of the normals).
+LEAST_PROMISE = 1e-6
 
 
 @dataclass(frozen=True)

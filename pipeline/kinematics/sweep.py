@@ -37,6 +37,15 @@ class Arm(NamedTuple):
     start: Pose
 
 
+class Release(NamedTuple):
+    """A body let go at the scan's attitude (deg), away from the scan pose by (dx, dy, dtheta) in mm and rad."""
+
+    flexion_deg: float
+    varus_deg: float
+    scan: Pose
+    away: tuple[float, float, float]
+
+
 class ArmResult(NamedTuple):
     """Cells of one arm in the order of its rows: on the way out and on the way back."""
 
@@ -74,6 +83,12 @@ def walk(bodies: Bodies, arm: Arm, settings: SweepSettings) -> ArmResult:
     out, last = _pass(attitudes, arm.start, arm.start, settings)
     back, _ = _pass(attitudes[::-1], last, arm.start, settings)
     return ArmResult(arm.column, arm.rows, out, back[::-1])
+
+
+def let_go(bodies: Bodies, release: Release, settings: SweepSettings) -> StablePose:
+    """Where a body comes to rest that was let go near the scan pose, pulled back far enough to be clear."""
+    contact = AttitudeContact(bodies, np.radians(release.flexion_deg), np.radians(release.varus_deg))
+    return solve_incremental(contact, release.scan.displaced(release.away), settings.solver, release.scan)
 
 
 def _pass(

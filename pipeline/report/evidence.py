@@ -13,7 +13,7 @@ from pipeline.geometry.mesh import TriangleMesh
 from pipeline.geometry.volume import LabelVolume
 from pipeline.kinematics.joint_coordinates import JointCoordinates, moved_from_scan
 from pipeline.kinematics.table import Grid, PoseTable, RawTable, SmoothTable, Status
-from pipeline.records import Anatomy, CaseFacts, MeshQuality, SurfaceOrigin
+from pipeline.records import Anatomy, CaseFacts, MeshQuality, ScanReturn, SurfaceOrigin
 
 Float = NDArray[np.float64]
 
@@ -49,6 +49,7 @@ class Evidence:
     moving: TriangleMesh
     origins: tuple[SurfaceOrigin, ...]
     raw: RawTable
+    scan_returns: tuple[ScanReturn, ...]
     smooth: SmoothTable
     findings: Mapping[str, Findings]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ PANEL_SHARE = 1.3
 LANDMARK: Color = (0, 0, 0)
 #: Lengths of the drawn axes as parts of the panel's half height.
 AXIS_SHARE, DELTA_SHARE = 0.55, 0.45
+#: Long axis -> the landmark that it is drawn through.
+SHAFT_OF = {"femoral_long_axis": "femur_shaft_centre", "tibial_long_axis": "tibia_shaft_centre"}
 
 
 def bones_picture(evidence: Evidence, settings: PictureSettings) -> Image:
@@ -38,7 +40,7 @@ def bones_picture(evidence: Evidence, settings: PictureSettings) -> Image:
         mark_edges(image, seen)
     legend = [(plain(name), structure_color(name)) for name in evidence.meshes]
     sheet = pictures.tiled([images])
-    title = "Bones as scanned; lines and dots are drawn through the bone"
+    title = "Bones as scanned; blue: flexion axis and long axes, orange: push, black: landmarks; all drawn through bone"
     return finished(evidence.facts, title, [sheet, *_landmark_list(evidence, sheet.shape[1])], legend)
 
 
@@ -53,15 +55,26 @@ def _annotate(image: Image, evidence: Evidence, seen: View) -> None:
     reference, moving = evidence.scan_from_reference, evidence.scan_from_moving
     length = AXIS_SHARE * seen.half_height_mm
     flexion = reference[:3, 3] + np.outer([-length, length], reference[:3, 0])
-    long_axis = reference[:3, 3] + np.outer([0.0, 1.5 * length], reference[:3, 2])
     push = moving[:3, 3] + np.outer([-DELTA_SHARE * seen.half_height_mm, 0.0], evidence.anatomy.delta)
     _axis(image, seen, flexion, "flexion axis")
-    _axis(image, seen, long_axis, "long axis")
+    for ends in _long_axes(evidence, length):
+        _axis(image, seen, ends, "")
     size = (image.shape[1], image.shape[0])
     ends = seen.pixels(push, size)
     pictures.draw_arrow(image, ends, DELTA)
     pictures.draw_tag(image, Text("Δ push", 15, BOLD, DELTA), (ends[0, 0] + 6, ends[0, 1]))
     _landmarks(image, evidence, seen)
+
+
+def _long_axes(evidence: Evidence, length: float) -> Iterator[Float]:
+    """(2, 3) ends of each long axis, through the centre of its shaft; only those that anatomy found."""
+    centers = {mark.name: np.array(mark.position) for mark in evidence.anatomy.landmarks}
+    joint = evidence.scan_from_moving[:3, 3]
+    for axis in evidence.anatomy.axes:
+        center = centers.get(SHAFT_OF.get(axis.name, ""))
+        if center is not None:
+            direction = np.array(axis.direction) * np.sign(np.dot(axis.direction, joint - center))
+            yield center + np.outer([-0.4 * length, length], direction)
 
 
 def _axis(image: Image, seen: View, ends: Float, words: str) -> None:
@@ -70,9 +83,9 @@ def _axis(image: Image, seen: View, ends: Float, words: str) -> None:
         pictures.draw_dots(image, pixels[:1], AXIS, 4.0)
         return
     pictures.draw_segments(image, pixels[None], AXIS, 2)
-    tip = pixels[np.argmin(pixels[:, 1])] if words == "long axis" else pixels[np.argmax(pixels[:, 0])]
-    align = 1.0 if tip[0] > 0.6 * image.shape[1] else 0.0
-    pictures.draw_tag(image, Text(words, 14, color=AXIS), (tip[0], tip[1] + 17), align)
+    tip = pixels[np.argmax(pixels[:, 0])]
+    if words:
+        pictures.draw_tag(image, Text(words, 14, color=AXIS), (tip[0], tip[1] + 17), 1.0)
 
 
 def _landmarks(image: Image, evidence: Evidence, seen: View) -> None:

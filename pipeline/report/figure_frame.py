@@ -52,17 +52,15 @@ def mark_edges(panel: Image, view: View, color: Color = pictures.GREY) -> None:
     """Write at the edges of a panel what lies there."""
     height, width = panel.shape[:2]
     left, right, top, bottom = (Text(words, 13, color=color) for words in view.edges)
-    write = pictures.draw_tag if panel[0, 0, 0] > 127 else pictures.draw_text
-    write(panel, left, (5, height / 2), 0.0)
-    write(panel, right, (width - 5, height / 2), 1.0)
-    write(panel, top, (width / 2, 38), 0.5)
-    write(panel, bottom, (width / 2, height - 8), 0.5)
+    pictures.draw_tag(panel, left, (5, height / 2))
+    pictures.draw_tag(panel, right, (width - 5, height / 2), 1.0)
+    pictures.draw_tag(panel, top, (width / 2, 40), 0.5)
+    pictures.draw_tag(panel, bottom, (width / 2, height - 8), 0.5)
 
 
 def title_panel(panel: Image, words: str, color: Color = pictures.INK) -> None:
     """Write the title of a panel into its top left corner."""
-    write = pictures.draw_tag if color == pictures.INK else pictures.draw_text
-    write(panel, Text(words, 16, BOLD, color), (7, 20), 0.0)
+    pictures.draw_tag(panel, Text(words, 16, BOLD, color), (7, 20))
 
 
 def words_panel(size_px: int, lines: Sequence[str]) -> Image:

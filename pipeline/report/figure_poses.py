@@ -149,7 +149,7 @@ def _from_above(evidence: Evidence) -> View:
 
 
 def _bar_labels(settings: PictureSettings) -> list[str]:
-    return [f"{value:g} mm" for value in np.linspace(0.0, settings.contact_range_mm, 4)]
+    return [f"{value:g} mm" for value in np.linspace(0.0, settings.contact_range_mm, 5)]
 
 
 def _contact_panel(evidence: Evidence, settings: PictureSettings, cell: Cell, seen: View) -> Image:

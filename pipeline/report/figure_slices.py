@@ -51,7 +51,7 @@ def _cuts(evidence: Evidence, settings: PictureSettings) -> list[tuple[str, View
         ("coronal", view(frame, "anterior", joint, half)),
         ("sagittal, medial", view(frame, sagittal, medial, half)),
         ("sagittal, lateral", view(frame, sagittal, lateral, half)),
-        ("axial, through the flexion axis", view(frame, "distal", frame[:3, 3], half)),
+        ("axial, flexion axis", view(frame, "distal", frame[:3, 3], half)),
     ]
 
 

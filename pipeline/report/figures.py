@@ -58,8 +58,8 @@ BONES = Figure(
     "bones",
     "Bones, landmarks and axes",
     Caption(
-        "The surfaces at the pose of the scan with the landmarks, the flexion axis, the long axis and the push Δ.",
-        "The flexion axis passes through both condyles, the long axis along the shaft, Δ along the tibia.",
+        "The surfaces at the pose of the scan with the landmarks, the flexion axis, the long axes and the push Δ.",
+        "The flexion axis passes through both condyles, long axes run along their shafts, Δ along the lower bone.",
         "An axis leaves its bone or is clearly tilted; a landmark lies on the wrong side or off the bone.",
         "Place the landmark in 3D Slicer, save landmarks.mrk.json beside the label map, and run the case again.",
     ),

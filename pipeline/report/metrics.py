@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.mesh import TriangleMesh, edge_defects
-from pipeline.kinematics.table import Grid, PoseTable, SmoothTable, Status
+from pipeline.kinematics.table import PoseTable, SmoothTable, Status
 from pipeline.records import Metric
 from pipeline.report.evidence import CURVES, STATUS_WORDS, Evidence, plain, usable
 from pipeline.report.settings import Limits
@@ -160,30 +160,21 @@ def jumps(raw: PoseTable, fitted: PoseTable) -> tuple[Float, Float]:
 
 
 def _scan_pose_metrics(evidence: Evidence) -> Iterator[Metric]:
-    flexion, varus, rotation, *shift = evidence.anatomy.scan_attitude
-    found = interpolated(evidence.raw.grid, evidence.raw.poses, flexion, varus)
-    if found is None:
-        return
-    off_mm, off_deg = float(np.linalg.norm(found[:3] - shift)), abs(float(found[3]) - rotation)
+    returns = evidence.scan_returns
     labelled = all(origin.origin == "labelled" for origin in evidence.origins)
-    hint = "small where cartilage and menisci were labelled" if labelled else "surfaces were made: expect millimetres"
-    meaning = f"Pose found at the attitude of the scan against the scan itself; {hint}."
-    yield info(Measured("scan_pose_mm", "Scan pose found again (shift)", off_mm, "mm", meaning))
-    yield info(Measured("scan_pose_deg", "Scan pose found again (rotation)", off_deg, "deg", meaning))
-
-
-def interpolated(grid: Grid, poses: PoseTable, flexion_deg: float, varus_deg: float) -> Float | None:
-    """The found coordinates (4,) at an attitude, bilinear; None outside the grid or beside an unusable entry."""
-    weights = []
-    for axis, value in ((grid.flexion_deg, flexion_deg), (grid.varus_deg, varus_deg)):
-        if not axis[0] <= value <= axis[-1]:
-            return None
-        weights.append(np.array([np.interp(value, axis, row) for row in np.eye(len(axis))]))
-    weight = np.outer(*weights)
-    touched = weight > 0.0
-    if not usable(poses)[touched].all():
-        return None
-    return np.array([float((getattr(poses, name)[touched] * weight[touched]).sum()) for name, _, _ in CURVES])
+    hint = "small where cartilage and menisci were labelled" if labelled else "surfaces are missing: expect millimetres"
+    settled = [one for one in returns if one.settled]
+    if settled:
+        starts = f"let go {len(returns)} times at and around the scan pose, at the attitude of the scan"
+        worst = max(one.shift_mm for one in settled)
+        meaning = f"Largest distance from the scan at rest, {starts}; {hint}."
+        yield info(Measured("scan_pose_mm", "Scan pose found again (shift)", worst, "mm", meaning))
+        worst = max(one.rotation_deg for one in settled)
+        meaning = f"Largest rotation from the scan at rest, {starts}; {hint}."
+        yield info(Measured("scan_pose_deg", "Scan pose found again (rotation)", worst, "deg", meaning))
+    lost = float(len(returns) - len(settled))
+    meaning = "Releases near the scan pose that came to no rest; the seat of the scan is not stable if there are any."
+    yield info(Measured("scan_pose_lost", "Scan pose lost", lost, "releases", meaning))
 
 
 def _smooth_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:

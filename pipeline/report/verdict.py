@@ -44,8 +44,8 @@ def metric_findings(metrics: Iterable[Metric]) -> Findings:
 
 
 def _numbers(metric: Metric) -> str:
-    value = f"{metric.value:.4g} {metric.unit}".rstrip()
-    return f"{metric.title[0].lower()}{metric.title[1:]} {value}, expected {metric.limit}"
+    title = f"{metric.title[0].lower()}{metric.title[1:]}"
+    return f"{title} {metric.value:.4g} {metric.unit}, expected {metric.limit} {metric.unit}"
 
 
 def picture_findings(missing: Mapping[str, str]) -> Findings:

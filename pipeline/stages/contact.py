@@ -14,6 +14,7 @@ from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, 
 from pipeline.errors import CaseRejected
 from pipeline.geometry.mesh import TriangleMesh, merged
 from pipeline.geometry.volume import LabelVolume
+from pipeline.geometry.voxel_mask import seen_as_right
 from pipeline.records import Anatomy, CaseFacts, SurfaceOrigin
 
 Mask = NDArray[np.bool_]
@@ -50,9 +51,10 @@ def _of_meshes(meshes: Mapping[str, TriangleMesh], names: list[str]) -> Triangle
 
 
 def _of_labels(reads: Inputs, params: Params, out: Outputs) -> Findings:
-    labels, facts, anatomy = reads[LABELS], reads[CASE_FACTS], reads[ANATOMY]
-    if labels is None:
+    given, facts, anatomy = reads[LABELS], reads[CASE_FACTS], reads[ANATOMY]
+    if given is None:
         raise ValueError("a case of labels has no label volume")
+    labels = seen_as_right(given, facts.side)
     near = _near_joint(labels, anatomy, params.reach_mm)
     masks = [_mask(labels, facts, names) & near for names in (params.reference, params.moving)]
     settings = SurfaceSettings(triangles=params.triangles)

@@ -25,9 +25,7 @@ class Params(StrictParams):
     """How smooth and how light the meshes are."""
 
     triangles: TriangleCount = Field(default=8000, description="triangles of a structure that has no number of its own")
-    triangles_of: dict[str, TriangleCount] = Field(
-        default={"femur": 20_000, "tibia": 20_000}, description="triangles of single structures"
-    )
+    triangles_of: dict[str, TriangleCount] = Field(default={}, description="triangles of single structures")
     smoothing_iterations: int = Field(default=50, ge=1, le=500, description="degree of the windowed sinc filter")
     smoothing_pass_bands: list[Annotated[float, Field(gt=0.0, le=2.0)]] = Field(
         default=[0.01, 0.03, 0.1],
@@ -41,9 +39,7 @@ class Params(StrictParams):
     deviation_limit_factor: float = Field(
         default=1.0, gt=0.0, le=10.0, description="largest distance from the voxels' surface, in voxel diagonals"
     )
-    required: list[str] = Field(
-        default=["femur", "tibia"], description="structures that must become one closed surface each"
-    )
+    required: list[str] = Field(default=[], description="structures that must become one closed surface each")
 
     def surface_settings(self, structure: str) -> SurfaceSettings:
         """Settings of one structure's surface."""

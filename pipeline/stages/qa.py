@@ -14,6 +14,7 @@ from pipeline.artifacts import (
     RAW_TABLE,
     REFERENCE_BODY,
     REPORT,
+    SCAN_RETURNS,
     SMOOTH_TABLE,
     SURFACE_ORIGINS,
     VERDICT,
@@ -61,6 +62,7 @@ def gather(reads: Inputs) -> Evidence:
         moving=reads[MOVING_BODY],
         origins=reads[SURFACE_ORIGINS],
         raw=reads[RAW_TABLE],
+        scan_returns=reads[SCAN_RETURNS],
         smooth=reads[SMOOTH_TABLE],
         findings={name: reads[artifact] for name, artifact in FINDINGS.items()},
     )
@@ -88,6 +90,7 @@ STAGE = Stage(
         MOVING_BODY,
         SURFACE_ORIGINS,
         RAW_TABLE,
+        SCAN_RETURNS,
         SMOOTH_TABLE,
         *FINDINGS.values(),
     ),

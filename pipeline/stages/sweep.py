@@ -8,15 +8,16 @@ from typing import Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from pipeline.adapters.contact_pool import map_contact
-from pipeline.artifacts import ANATOMY, MOVING_BODY, RAW_TABLE, REFERENCE_BODY
+from pipeline.adapters.contact_pool import ContactPair, map_contact
+from pipeline.artifacts import ANATOMY, MOVING_BODY, RAW_TABLE, REFERENCE_BODY, SCAN_RETURNS
 from pipeline.contact_params import ContactParams
 from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage
 from pipeline.errors import CaseRejected
 from pipeline.kinematics.body_frames import scan_pose
-from pipeline.kinematics.incremental import IncrementalSettings
-from pipeline.kinematics.sweep import SweepSettings, arms, assemble, walk
+from pipeline.kinematics.incremental import IncrementalSettings, StablePose
+from pipeline.kinematics.sweep import Release, SweepSettings, arms, assemble, let_go, walk
 from pipeline.kinematics.table import Grid, RawTable, Status
+from pipeline.records import Anatomy, ScanReturn
 
 MAX_CELLS = 100_000
 
@@ -37,6 +38,10 @@ class Params(ContactParams):
     slide_bound_mm: float = Field(30.0, gt=0, le=200, description="farther than this from the scan pose: slid off")
     rotation_bound_deg: float = Field(45.0, gt=0, le=179, description="farther than this from the scan pose: bound")
     max_motions: int = Field(400, ge=10, le=100_000, description="motions after which a cell is not converged")
+    scan_shift_mm: float = Field(
+        2.0, ge=0, le=20, description="how far from the scan pose the body is let go, as a test"
+    )
+    scan_turn_deg: float = Field(3.0, ge=0, le=30, description="the same for the rotation")
     classic: bool = Field(default=False, description="the paper's plain rules, without the deeper-only guard")
 
     @model_validator(mode="after")
@@ -84,7 +89,34 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
             "Check that cartilage and menisci are labelled, and that the bones are those of one joint.",
         )
     out[RAW_TABLE] = table
+    out[SCAN_RETURNS] = _scan_returns(anatomy, params, pair, out.jobs)
     return _findings(table)
+
+
+def _scan_returns(anatomy: Anatomy, params: Params, pair: ContactPair, jobs: int) -> tuple[ScanReturn, ...]:
+    """The body let go at the scan's own attitude, at the scan pose and away from it to every side."""
+    scan = scan_pose(anatomy.scan_attitude)
+    flexion, varus = anatomy.scan_attitude[:2]
+    shift, turn = params.scan_shift_mm, float(np.radians(params.scan_turn_deg))
+    aways = [(0.0, 0.0, 0.0)]
+    aways += [way for s in (1.0, -1.0) for way in ((s * shift, 0.0, 0.0), (0.0, s * shift, 0.0), (0.0, 0.0, s * turn))]
+    releases = [Release(flexion, varus, scan, away) for away in aways]
+    found = map_contact(partial(let_go, settings=_settings(params)), releases, pair, jobs)
+    return tuple(_scan_return(release, stable) for release, stable in zip(releases, found, strict=True))
+
+
+def _scan_return(release: Release, stable: StablePose) -> ScanReturn:
+    settled = stable.status is Status.OK
+    dx, dy, dz, turn = np.subtract(stable.pose, release.scan) if settled else np.zeros(4)
+    return ScanReturn(
+        start_lateral_mm=release.away[0],
+        start_anterior_mm=release.away[1],
+        start_rotation_deg=float(np.degrees(release.away[2])),
+        settled=settled,
+        shift_mm=float(np.hypot(dx, dy)),
+        rotation_deg=float(np.degrees(abs(turn))),
+        sinking_mm=float(dz),
+    )
 
 
 def _settings(params: Params) -> SweepSettings:
@@ -121,4 +153,4 @@ def _findings(table: RawTable) -> Findings:
     return note, review
 
 
-STAGE = Stage(60, "sweep", (ANATOMY, REFERENCE_BODY, MOVING_BODY), (RAW_TABLE,), Params, run)
+STAGE = Stage(60, "sweep", (ANATOMY, REFERENCE_BODY, MOVING_BODY), (RAW_TABLE, SCAN_RETURNS), Params, run)

@@ -38,7 +38,7 @@ BAD_MESHES = [
 
 @pytest.mark.parametrize("as_moving", [False, True])
 @pytest.mark.parametrize(("mesh", "problem"), BAD_MESHES)
-def test_unusable_meshes_are_refused(mesh: TriangleMesh, problem: str, as_moving: bool) -> None:
+def test_unusable_meshes_are_refused(mesh: TriangleMesh, problem: str, *, as_moving: bool) -> None:
     with pytest.raises(ValueError, match=problem):
         FclBodies(CUBE, mesh) if as_moving else FclBodies(mesh, CUBE)
 
@@ -58,7 +58,7 @@ BAD_PLACEMENTS = [
 def test_unusable_placements_are_refused(rotation: Float, shift: Float) -> None:
     bodies = FclBodies(CUBE, CUBE)
     for ask in (bodies.intersect, bodies.crossing_pairs):
-        with pytest.raises(ValueError, match="a proper rotation .* and a finite shift"):
+        with pytest.raises(ValueError, match=r"a proper rotation .* and a finite shift"):
             ask(rotation, shift)
 
 

@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 Float = NDArray[np.float64]
 
-_STEP_MM = 0.5
+_STEP_MM = 0.7
 _FAR_MM = 60.0
 _X = np.arange(-40.0, 40.1, _STEP_MM)
 _Y = np.arange(-27.0, 27.1, _STEP_MM)
@@ -82,7 +82,7 @@ def resting_offset(surface: Float, points: Float, start: Float) -> Float:
     """Offset (x mm, y mm, rotation deg) where nothing near goes deeper, climbing from ``start``."""
     offset, step = start.copy(), np.array([1.0, 1.0, 2.0])
     best = travel_mm(surface, points, offset)
-    while step[0] > 0.1:
+    while step[0] > 0.2:
         trials = [offset + move * step for move in _MOVES]
         travels = [travel_mm(surface, points, trial) for trial in trials]
         if max(travels) > best + 1e-6:

@@ -32,7 +32,9 @@ def test_dish_against_its_equations() -> None:
 def test_winding_number_is_whole_and_turns_with_the_surface() -> None:
     points = np.array([[0.1, 0.2, 0.3], [5.0, 0.0, 0.0]])
     np.testing.assert_allclose(winding_number(points, CUBE), [1.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(winding_number(points, TriangleMesh(CUBE.points, CUBE.triangles[:, ::-1])), [-1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(
+        winding_number(points, TriangleMesh(CUBE.points, CUBE.triangles[:, ::-1])), [-1.0, 0.0], atol=1e-12
+    )
     np.testing.assert_allclose(winding_number(points, joined(CUBE, CUBE)), [2.0, 0.0], atol=1e-12)
 
 
@@ -52,7 +54,7 @@ def test_many_points_are_taken_in_blocks() -> None:
         (ball(4.0), joined(shifted(CUBE, -30.0), shifted(CUBE, 9.0)), False),
     ],
 )
-def test_nested_bodies_either_way_round(first: TriangleMesh, second: TriangleMesh, expected: bool) -> None:
+def test_nested_bodies_either_way_round(first: TriangleMesh, second: TriangleMesh, *, expected: bool) -> None:
     assert nested(first, second) is expected
     assert nested(second, first) is expected
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from pipeline.geometry.triangles import near_features
+from pipeline.geometry.triangles import near_features, with_neighbours
 
 Float = NDArray[np.float64]
 FLAT = np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
@@ -89,7 +89,7 @@ def test_a_corner_above_a_shared_edge_is_seen_by_one_of_the_faces(seed: int) -> 
         across = np.array([a[1] - b[1], b[0] - a[0], 0.0])
         faces = np.array([[a, b, (a + b) / 2 + across], [b, a, (a + b) / 2 - across]])
         tip = a + random.uniform(0.1, 0.9) * (b - a) + [0.0, 0.0, 0.01]
-        spike = np.array([tip, tip + [0.0, 0.1, 1.0], tip + [0.1, 0.0, 1.0]])
+        spike = tip + np.array([[0.0, 0.0, 0.0], [0.0, 0.1, 1.0], [0.1, 0.0, 1.0]])
         assert len(near_features(faces, np.array([spike, spike]), 0.02).distance) > 0
 
 
@@ -101,7 +101,7 @@ def test_an_upright_wall_touches_with_its_lower_corners() -> None:
 
 
 @pytest.mark.parametrize("swap", [False, True])
-def test_backs_do_not_push(swap: bool) -> None:
+def test_backs_do_not_push(*, swap: bool) -> None:
     spike = np.array([[1.0, 1.0, 0.25], [2.0, 1.0, 3.0], [1.0, 2.0, 3.0]])
     first, second = (FLAT[::-1], spike[[0, 2, 1]]) if swap else (FLAT, spike)
     assert len(near_features(first[None], second[None], 1.0).distance) == 0
@@ -126,3 +126,26 @@ def test_degenerate_triangles_and_no_pairs_are_harmless() -> None:
     line = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     assert len(near_features(line[None], FLAT[None] + 0.1, 1.0).distance) == 0
     assert len(near_features(np.empty((0, 3, 3)), np.empty((0, 3, 3)), 1.0).distance) == 0
+
+
+def test_neighbours_of_a_tetrahedron_and_of_a_lone_triangle() -> None:
+    solid = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]], dtype=np.int32)
+    found = with_neighbours(solid)
+    np.testing.assert_array_equal(found[:, :3], solid)
+    for row in found:
+        assert set(row[:3].tolist()) | {int(row[3])} == {0, 1, 2, 3}
+    assert found[0].tolist() == [0, 1, 2, 3, 3, 3]
+    assert with_neighbours(solid[:1]).tolist() == [[0, 1, 2, 2, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("rise", "reacts"), [(-0.5, True), (0.0, False), (0.5, False)], ids=["ridge", "flat", "valley"]
+)
+def test_an_edge_reacts_on_a_ridge_only(rise: float, *, reacts: bool) -> None:
+    """The slanting lower edge of a blade above the line y = 0 that two faces share, nearest to it at (0.2, 0, 0)."""
+    points = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -2.0, rise], [0.0, 2.0, rise]])
+    sides = points[with_neighbours(np.array([[1, 0, 2], [0, 1, 3]], dtype=np.int32))]
+    blade = oriented(np.array([[[0.1, -0.2, 0.04], [0.3, 0.2, 0.08], [0.5, -0.2, 0.9]]]), -1.0)
+    found = [near_features(side[None], blade, 0.1) for side in sides]
+    on_edge = [bool(np.any(np.abs(features.on_first[:, 1]) < 1e-9)) for features in found]
+    assert any(on_edge) is reacts

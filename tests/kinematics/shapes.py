@@ -34,7 +34,7 @@ def joined(*meshes: TriangleMesh) -> TriangleMesh:
 
 
 def shifted(mesh: TriangleMesh, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> TriangleMesh:
-    return TriangleMesh(mesh.points + [x, y, z], mesh.triangles)
+    return TriangleMesh(mesh.points + np.array([x, y, z]), mesh.triangles)
 
 
 def turned_down(mesh: TriangleMesh) -> TriangleMesh:

@@ -55,7 +55,9 @@ def test_where_contacts_lie_in_space_does_not_matter() -> None:
     points = random.normal(size=(6, 3)) * 10.0
     normals = np.array([tilted(a, d) for a, d in random.uniform(0.1, 3.0, (6, 2)) * [0.4, 2.0]])
     here = equilibrium_residual(contacts_of(points[:3], normals[:3]))
-    assert equilibrium_residual(contacts_of(points[:3] + [400.0, -90.0, 7.0], normals[:3])) == pytest.approx(here)
+    assert equilibrium_residual(contacts_of(points[:3] + np.array([400.0, -90.0, 7.0]), normals[:3])) == pytest.approx(
+        here
+    )
 
 
 def test_ball_in_its_dish() -> None:

@@ -36,7 +36,7 @@ def differences(height: Height, at: tuple[float, float, float], step: float = 1e
 
 
 def unit(*vector: float) -> Float:
-    return np.asarray(vector) / np.linalg.norm(vector)
+    return np.asarray(np.asarray(vector) / np.linalg.norm(vector))
 
 
 NORMALS = [unit(0.3, -0.2, -1.0), unit(-0.8, 0.5, -0.6), unit(0.0, 0.0, -1.0)]
@@ -160,9 +160,7 @@ def test_contacts_do_not_depend_on_the_triangulation() -> None:
 def test_everything_is_told_in_the_attitude_frame(flexion: float, varus: float) -> None:
     """A reference turned with the attitude is met exactly as before."""
     upright, turn = BarOnPyramids().pair(), attitude_rotation(flexion, varus)
-    turned = type(upright.reference_body)(
-        upright.reference_body.points @ turn.T, upright.reference_body.triangles
-    )
+    turned = type(upright.reference_body)(upright.reference_body.points @ turn.T, upright.reference_body.triangles)
     pairs = [falling(upright), at_attitude(turned, upright.moving_body, flexion, varus)]
     start = Pose(0.4, 0.5, -20.0, 0.1)
     here, there = (drop(pair, start, EXACT) for pair in pairs)

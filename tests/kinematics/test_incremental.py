@@ -11,34 +11,21 @@ from pipeline.geometry.containment import nested
 from pipeline.geometry.validation_objects import BallInDish, BarOnPyramids, ball, box, dish
 from pipeline.kinematics.certificate import equilibrium_residual
 from pipeline.kinematics.contact import AttitudeContact, Pose
-from pipeline.kinematics.descent import MotionSettings, drop
-from pipeline.kinematics.incremental import IncrementalSettings, StablePose, solve_incremental
+from pipeline.kinematics.descent import drop
+from pipeline.kinematics.incremental import StablePose, solve_incremental
 from pipeline.kinematics.table import Status
+from tests.kinematics.settings import (
+    BALL_STARTS,
+    BAR_STARTS,
+    FINE,
+    FINE_BAR,
+    LARGE_MM,
+    PAPER,
+    SMOOTH,
+    with_steps,
+)
 from tests.kinematics.shapes import at_attitude, ellipsoid, falling, joined, shifted, turned_down
 
-PAPER = IncrementalSettings()
-#: Facets of smooth bodies are closer together than the default band; only what truly touches is to react.
-SMOOTH = replace(PAPER, contact_band_mm=0.002)
-#: A fifth of the paper's resolutions, with contact exact enough to see the smaller gain.
-FINE = replace(
-    PAPER,
-    translation_resolution_mm=0.02,
-    rotation_resolution_rad=float(np.radians(0.02)),
-    contact_band_mm=2e-4,
-    gain_mm=4e-6,
-    motion=MotionSettings(tolerance_mm=1e-6),
-)
-FINE_BAR = replace(FINE, contact_band_mm=0.05)
-LARGE_MM = {"ball": 12.0, "bar": 20.0}
-
-BALL_STARTS = [Pose(2.5, 1.5, -20, 0), Pose(-3, 1, -20, 0.2), Pose(0.5, -4, -20, 0), Pose(0.3, 0.2, -20, 0)]
-BAR_STARTS = [
-    Pose(1.5, 2, -20, 0.28),
-    Pose(-2, -5, -20, -0.2),
-    Pose(0.5, 0, -20, 0.1),
-    Pose(0.37, 10, -20, -0.02),
-    Pose(3, -15, -20, 0.3),
-]
 each_ball_start = pytest.mark.parametrize("start", BALL_STARTS)
 each_bar_start = pytest.mark.parametrize("start", BAR_STARTS)
 stepping = pytest.mark.parametrize("large", [False, True], ids=["paper steps", "steps as large as the object"])
@@ -52,11 +39,6 @@ def bowl() -> AttitudeContact:
 @pytest.fixture(scope="module")
 def pyramids() -> AttitudeContact:
     return falling(BarOnPyramids().pair())
-
-
-def with_steps(settings: IncrementalSettings, step_mm: float) -> IncrementalSettings:
-    """Steps of this size; a turn of 60 degrees moves the bar's ends farther than its width."""
-    return replace(settings, translation_step_mm=step_mm, rotation_step_rad=float(np.radians(60.0)))
 
 
 def check_ball(found: StablePose, within_mm: float) -> None:
@@ -75,14 +57,14 @@ def check_bar(found: StablePose, within_mm: float, within_deg: float) -> None:
 
 @stepping
 @each_ball_start
-def test_ball_comes_to_rest_in_the_middle(bowl: AttitudeContact, start: Pose, large: bool) -> None:
+def test_ball_comes_to_rest_in_the_middle(bowl: AttitudeContact, start: Pose, *, large: bool) -> None:
     settings = with_steps(SMOOTH, LARGE_MM["ball"]) if large else SMOOTH
     check_ball(solve_incremental(bowl, start, settings), 0.1)
 
 
 @stepping
 @each_ball_start
-def test_ball_at_a_fifth_of_the_resolution(bowl: AttitudeContact, start: Pose, large: bool) -> None:
+def test_ball_at_a_fifth_of_the_resolution(bowl: AttitudeContact, start: Pose, *, large: bool) -> None:
     settings = with_steps(FINE, LARGE_MM["ball"]) if large else FINE
     check_ball(solve_incremental(bowl, start, settings), 0.02)
 
@@ -108,14 +90,14 @@ def test_ball_by_the_plain_rules(bowl: AttitudeContact, start: Pose) -> None:
 
 @stepping
 @each_bar_start
-def test_bar_turns_onto_both_pyramids(pyramids: AttitudeContact, start: Pose, large: bool) -> None:
+def test_bar_turns_onto_both_pyramids(pyramids: AttitudeContact, start: Pose, *, large: bool) -> None:
     settings = with_steps(PAPER, LARGE_MM["bar"]) if large else PAPER
     check_bar(solve_incremental(pyramids, start, settings), 0.1, 0.2)
 
 
 @stepping
 @each_bar_start
-def test_bar_at_a_fifth_of_the_resolution(pyramids: AttitudeContact, start: Pose, large: bool) -> None:
+def test_bar_at_a_fifth_of_the_resolution(pyramids: AttitudeContact, start: Pose, *, large: bool) -> None:
     settings = with_steps(FINE_BAR, LARGE_MM["bar"]) if large else FINE_BAR
     check_bar(solve_incremental(pyramids, start, settings), 0.02, 0.05)
 
@@ -136,7 +118,7 @@ def test_bar_by_the_plain_rules_with_large_steps(pyramids: AttitudeContact, star
 
 
 @pytest.mark.parametrize("classic", [False, True])
-def test_cycle_case_of_the_paper(pyramids: AttitudeContact, classic: bool) -> None:
+def test_cycle_case_of_the_paper(pyramids: AttitudeContact, *, classic: bool) -> None:
     """From 0.5 mm aside a step of 1 mm leads from one pyramid to the other for ever: only halved steps touch both."""
     for x, side in ((0.5, 1.0), (-0.5, -1.0)):
         landed = drop(pyramids, Pose(x, 0.0, -20.0, 0.1), PAPER.motion)
@@ -231,7 +213,7 @@ class Recorded(AttitudeContact):
 
 
 @stepping
-def test_guarded_search_never_loses_depth(pyramids: AttitudeContact, large: bool) -> None:
+def test_guarded_search_never_loses_depth(pyramids: AttitudeContact, *, large: bool) -> None:
     recorded = Recorded(pyramids)
     solve_incremental(recorded, BAR_STARTS[4], with_steps(PAPER, 20.0) if large else PAPER)
     heights = np.array([pose.z for pose in recorded.stood])

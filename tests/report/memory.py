@@ -14,6 +14,7 @@ from pipeline.artifacts import (
     MOVING_BODY,
     RAW_TABLE,
     REFERENCE_BODY,
+    SCAN_RETURNS,
     SMOOTH_TABLE,
     SURFACE_ORIGINS,
 )
@@ -68,6 +69,7 @@ def reads_of(evidence: Evidence) -> MemoryReads:
         MOVING_BODY.name: evidence.moving,
         SURFACE_ORIGINS.name: evidence.origins,
         RAW_TABLE.name: evidence.raw,
+        SCAN_RETURNS.name: evidence.scan_returns,
         SMOOTH_TABLE.name: evidence.smooth,
     }
     return MemoryReads(values | {findings_of(name).name: found for name, found in evidence.findings.items()})

@@ -15,13 +15,24 @@ from pipeline.engine.stage import Finding, Findings, Severity
 from pipeline.geometry.mesh import TriangleMesh, merged, transformed
 from pipeline.geometry.volume import LabelVolume
 from pipeline.kinematics.table import CurveFit, Grid, PoseTable, RawTable, SmoothTable, Status
-from pipeline.records import Anatomy, AxisEstimate, CaseFacts, Landmark, Matrix, MeshQuality, Side, SurfaceOrigin
+from pipeline.records import (
+    Anatomy,
+    AxisEstimate,
+    CaseFacts,
+    Landmark,
+    Matrix,
+    MeshQuality,
+    ScanReturn,
+    Side,
+    SurfaceOrigin,
+)
 from pipeline.report.evidence import Evidence
 
 Float = NDArray[np.float64]
 
 SPACING_MM = 2.0
 CONDYLE_MM = 20.0
+RETURNS = (ScanReturn(0.0, 0.0, 0.0, True, 0.02, 0.04, -0.1), ScanReturn(2.0, 0.0, 0.0, True, 0.05, 0.02, -0.1))
 STAGES = ("intake", "mesh", "anatomy", "contact", "sweep", "smooth")
 
 
@@ -41,6 +52,7 @@ def sample_evidence(side: Side = "right", case_id: str = "SAMPLE-1") -> Evidence
         moving=merged([meshes["tibia"], meshes["medial_meniscus"]]),
         origins=_origins(),
         raw=_raw(grid, fitted),
+        scan_returns=RETURNS,
         smooth=_smooth(grid, fitted),
         findings={name: _findings(name) for name in STAGES},
     )
@@ -50,6 +62,21 @@ def with_status(evidence: Evidence, at: tuple[int, int], status: Status) -> Evid
     """The same evidence with one entry of both tables unusable."""
     raw, smooth = _failed(evidence.raw.poses, at, status), _failed(evidence.smooth.poses, at, status)
     return replace(evidence, raw=replace(evidence.raw, poses=raw), smooth=replace(evidence.smooth, poses=smooth))
+
+
+def only_one_attitude(evidence: Evidence) -> Evidence:
+    """The same bodies as a test object has them: given meshes, no landmarks, one flexion and one varus."""
+    grid = Grid(np.array([0.0]), np.array([0.0]))
+    fitted = _poses(grid)
+    return replace(
+        evidence,
+        facts=replace(evidence.facts, source="meshes"),
+        labels=None,
+        mesh_quality=(),
+        anatomy=replace(evidence.anatomy, landmarks=(), axes=(), side_evidence=()),
+        raw=_raw(grid, fitted),
+        smooth=_smooth(grid, fitted),
+    )
 
 
 def frame_of(side: Side) -> Float:
@@ -161,12 +188,12 @@ def _anatomy(side: Side, frame: Float) -> Anatomy:
     landmarks = (
         Landmark("lateral_epicondyle", at(36.0, 0.0, 0.0), 1.2, "found"),
         Landmark("medial_epicondyle", at(-36.0, 0.0, 0.0), 1.0, "given"),
-        Landmark("plateau_center", at(0.0, 0.0, -CONDYLE_MM), 0.7, "found"),
+        Landmark("femur_shaft_centre", at(0.0, 0.0, 60.0), 0.7, "found"),
     )
     axes = (
         AxisEstimate("flexion_axis", along(0), 0.8, "fit to the condyles"),
-        AxisEstimate("femur_long_axis", along(2), 1.5, "shaft"),
-        AxisEstimate("tibia_long_axis", along(2), 1.7, "shaft"),
+        AxisEstimate("femoral_long_axis", along(2), 1.5, "shaft"),
+        AxisEstimate("tibial_long_axis", along(2), 1.7, "shaft"),
     )
     plateau = frame.copy()
     plateau[:3, 3] = at(0.0, 0.0, -CONDYLE_MM)

@@ -13,7 +13,7 @@ from pipeline.geometry.mesh import TriangleMesh
 from pipeline.kinematics.table import PoseTable, SmoothTable, Status
 from pipeline.records import Metric
 from pipeline.report.evidence import Evidence
-from pipeline.report.metrics import all_metrics, interpolated, jumps, open_edges, untested
+from pipeline.report.metrics import all_metrics, jumps, open_edges, untested
 from pipeline.report.settings import Limits
 from pipeline.report.verdict import guarantees
 from tests.report.sample import revolved, sample_evidence, with_status
@@ -145,29 +145,14 @@ def test_the_motion_itself_is_no_jump() -> None:
     assert not turn.any()
 
 
-def test_interpolation_is_exact_for_a_bilinear_table() -> None:
-    grid = sample_evidence().raw.grid
-    plane = (
-        2.0 * grid.flexion_deg[:, None] + 3.0 * grid.varus_deg[None] + 0.1 * np.outer(grid.flexion_deg, grid.varus_deg)
-    )
-    found = interpolated(grid, poses(lateral_mm=plane), 33.0, -1.5)
-    assert found is not None
-    assert found[0] == pytest.approx(2.0 * 33.0 - 3.0 * 1.5 - 0.1 * 33.0 * 1.5)
-
-
-def test_interpolation_stays_within_the_usable_grid() -> None:
-    evidence = with_status(sample_evidence(), (5, 1), Status.SLID_OFF)
-    grid, table = evidence.raw.grid, evidence.raw.poses
-    assert interpolated(grid, table, 121.0, 0.0) is None
-    assert interpolated(grid, table, 45.0, 0.0) is None
-    assert interpolated(grid, table, 40.0, 0.0) is not None
-
-
-def test_the_scan_pose_is_compared_only_inside_the_grid() -> None:
+def test_the_scan_pose_counts_the_worst_release_and_the_lost_ones() -> None:
     evidence = sample_evidence()
-    outside = replace(evidence.anatomy, scan_attitude=(-5.0, 0.0, 0.0, 0.0, 0.0, -20.0))
-    assert "scan_pose_mm" in measured(evidence)
-    assert "scan_pose_mm" not in measured(replace(evidence, anatomy=outside))
+    lost = replace(evidence.scan_returns[0], settled=False)
+    metrics = measured(replace(evidence, scan_returns=(*evidence.scan_returns, lost)))
+    assert metrics["scan_pose_mm"].value == max(one.shift_mm for one in evidence.scan_returns)
+    assert metrics["scan_pose_deg"].value == max(one.rotation_deg for one in evidence.scan_returns)
+    assert metrics["scan_pose_lost"].value == 1.0
+    assert "scan_pose_mm" not in measured(replace(evidence, scan_returns=(lost,)))
 
 
 def test_middles_beside_an_unusable_entry_need_no_test() -> None:

@@ -16,7 +16,7 @@ from pipeline.report import figures
 from pipeline.report.settings import Limits, PictureSettings
 from pipeline.stages.qa import STAGE, Params
 from tests.report.memory import MemoryOutputs, reads_of
-from tests.report.sample import sample_evidence, with_status
+from tests.report.sample import only_one_attitude, sample_evidence, with_status
 
 SMALL = Params(pictures=PictureSettings(panel_px=150, flexions_deg=[0.0, 90.0]))
 IMAGES = {f"images/{name}.png" for name in ("slices", "bones", "poses", "contact", "curves", "checks")}
@@ -94,3 +94,11 @@ def test_a_run_from_the_cache_loads_no_library_that_draws() -> None:
     code = f"import sys, pipeline.stages.qa; print([n for n in {heavy} if n in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_table_of_one_attitude_is_reported() -> None:
+    evidence = only_one_attitude(sample_evidence("left"))
+    out = MemoryOutputs()
+    assert STAGE.run(reads_of(evidence), SMALL, out) == ()
+    files = out.value(REPORT)
+    assert set(files) == {"report.html", *IMAGES} - {"images/slices.png"}

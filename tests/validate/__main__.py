@@ -1,0 +1,33 @@
+"""Prints the table; the exit code is 1 where a target is missed."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from tests.validate import Measurement, Row
+from tests.validate.paper_objects import ROWS as PAPER_OBJECTS
+
+ROWS: tuple[Measurement, ...] = (*PAPER_OBJECTS,)
+
+
+def line(row: Row) -> str:
+    """One row as text."""
+    return (
+        f"{row.name:<44}{row.value:>12.2e} {row.unit:<5} at most {row.target:<8g}{'' if row.met else 'MISSED'}".rstrip()
+    )
+
+
+def main(measurements: Sequence[Measurement]) -> int:
+    """Measure, print each row as soon as it is known, and say whether every target was met."""
+    met = True
+    for measure in measurements:
+        row = measure()
+        sys.stdout.write(line(row) + "\n")
+        sys.stdout.flush()
+        met = met and row.met
+    return 0 if met else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(ROWS))

@@ -1,0 +1,80 @@
+"""The ball in the dish and the bar on the pyramids: the worst error over several starts, at steps small and large."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.validation_objects import BallInDish, BarOnPyramids
+from pipeline.kinematics.certificate import equilibrium_residual
+from pipeline.kinematics.contact import AttitudeContact, Pose
+from pipeline.kinematics.incremental import IncrementalSettings, solve_incremental
+from pipeline.kinematics.table import Status
+from tests.kinematics.settings import BALL_STARTS, BAR_STARTS, FINE, FINE_BAR, LARGE_MM, with_steps
+from tests.kinematics.shapes import falling
+from tests.validate import Row
+
+Float = NDArray[np.float64]
+
+
+def _rests(contact: AttitudeContact, starts: list[Pose], settings: IncrementalSettings, large_mm: float) -> Float:
+    """(N, 5) x, y, z, theta and residual of every start with either step; NaN where no stable pose was found."""
+    rows = []
+    for chosen in (settings, with_steps(settings, large_mm)):
+        for start in starts:
+            found = solve_incremental(contact, start, chosen)
+            residual = equilibrium_residual(contact.contacts(found.pose, chosen.contact_band_mm))
+            rows.append((*found.pose, residual) if found.status is Status.OK else (np.nan,) * 5)
+    return np.array(rows)
+
+
+@cache
+def _ball() -> Float:
+    return _rests(falling(BallInDish().pair()), BALL_STARTS, FINE, LARGE_MM["ball"])
+
+
+@cache
+def _bar() -> Float:
+    return _rests(falling(BarOnPyramids().pair()), BAR_STARTS, FINE_BAR, LARGE_MM["bar"])
+
+
+def ball_off_centre() -> Row:
+    """Distance of the ball's centre from the dish's axis."""
+    return Row("ball in dish: off the axis", float(np.hypot(_ball()[:, 0], _ball()[:, 1]).max()), "mm", 0.02)
+
+
+def ball_height() -> Row:
+    """Height of the ball's centre against its radius."""
+    return Row("ball in dish: height", float(np.abs(_ball()[:, 2] + 6.0).max()), "mm", 0.02)
+
+
+def ball_equilibrium() -> Row:
+    """What the contacts do not balance of a unit push."""
+    return Row("ball in dish: equilibrium residual", float(_ball()[:, 4].max()), "", 0.01)
+
+
+def bar_sideways() -> Row:
+    """Displacement of the bar from the middle."""
+    return Row("bar on pyramids: sideways", float(np.abs(_bar()[:, 0]).max()), "mm", 0.02)
+
+
+def bar_height() -> Row:
+    """Height of the bar against the closed form."""
+    return Row(
+        "bar on pyramids: height", float(np.abs(_bar()[:, 2] + BarOnPyramids().rest_height_mm).max()), "mm", 0.02
+    )
+
+
+def bar_turn() -> Row:
+    """Turn that the torque left."""
+    return Row("bar on pyramids: turn", float(np.degrees(np.abs(_bar()[:, 3]).max())), "deg", 0.05)
+
+
+def bar_equilibrium() -> Row:
+    """What the contacts do not balance of a unit push."""
+    return Row("bar on pyramids: equilibrium residual", float(_bar()[:, 4].max()), "", 0.01)
+
+
+ROWS = (ball_off_centre, ball_height, ball_equilibrium, bar_sideways, bar_height, bar_turn, bar_equilibrium)
