@@ -43,6 +43,29 @@ SUMMARIES = {
 }
 
 
+FLOW_START, FLOW_END = "<!-- flow: written by `make docs` -->", "<!-- end of flow -->"
+PIPELINE_README = Path(__file__).parents[1] / "pipeline" / "README.md"
+
+
+def flow_table() -> str:
+    """The flow as a table: every stage, what it does, reads and leaves."""
+    rows = [*_table("stage", "does", "reads", "leaves")]
+    for stage in FLOW:
+        does = _plain((sys.modules[stage.run.__module__].__doc__ or "").split("\n\n")[0]).split(": ", 1)[1]
+        reads = [a.name for a in stage.reads if not a.name.endswith("_findings")]
+        findings = [a.name.removesuffix("_findings") for a in stage.reads if a.name.endswith("_findings")]
+        if findings:
+            reads.append(f"findings of {', '.join(findings)}")
+        leaves = ", ".join(f"`{a.file}`" for a in stage.writes)
+        rows.append(_row(f"`{stage.folder}`", does, ", ".join(reads), leaves))
+    return "\n".join(rows)
+
+
+def _with_flow(text: str) -> str:
+    start, end = text.index(FLOW_START) + len(FLOW_START), text.index(FLOW_END)
+    return f"{text[:start]}\n{flow_table()}\n{text[end:]}"
+
+
 def pages() -> dict[str, str]:
     """File name -> text of every reference page."""
     return {"commands.md": commands_page(), "settings.md": settings_page(), "messages.md": messages_page()}
@@ -180,7 +203,8 @@ def _template(value: ast.expr) -> str:
 
 
 def main() -> None:
-    """Write the pages into the folder that is given."""
+    """Write the pages into the folder that is given, and the flow into the architecture page."""
+    PIPELINE_README.write_text(_with_flow(PIPELINE_README.read_text()))
     for name, text in pages().items():
         (Path(sys.argv[1]) / name).write_text(text)
 

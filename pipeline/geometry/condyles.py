@@ -103,6 +103,8 @@ def _spheres(femur: TriangleMesh, axes: Float, patch: Patch) -> tuple[Sphere, Sp
 
 def _notch(local: Float) -> float:
     """Lateral coordinate of the notch: where the posterior outline of the epiphysis is farthest forward."""
+    if not len(local):
+        raise ValueError("the femur is too short to show its condyles")
     low, high = np.quantile(local[:, 0], [0.01, 0.99])
     edges = np.linspace(low + 0.25 * (high - low), low + 0.75 * (high - low), 27)
     strip = np.digitize(local[:, 0], edges)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from pipeline.geometry.mesh import TriangleMesh
 
@@ -52,7 +52,7 @@ def nested(first: TriangleMesh, second: TriangleMesh) -> bool:
     first, second : TriangleMesh
         Closed, in one frame.
     """
-    return bool(contains(second, _one_point_each(first)).any() or contains(first, _one_point_each(second)).any())
+    return bool(contains(second, piece_points(first)).any() or contains(first, piece_points(second)).any())
 
 
 def _solid_angles(points: Float, corners: Float) -> Float:
@@ -68,8 +68,12 @@ def _dot(a: Float, b: Float) -> Float:
     return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
-def _one_point_each(mesh: TriangleMesh) -> Float:
+@lru_cache(maxsize=8)
+def piece_points(mesh: TriangleMesh) -> Float:
     """(P, 3) one vertex of each connected piece of a mesh; vertices of no triangle do not count."""
+    from scipy.sparse import coo_array  # noqa: PLC0415 - not loaded by a cached run
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
     start, end = mesh.triangles[:, [0, 1, 2]].ravel(), mesh.triangles[:, [1, 2, 0]].ravel()
     links = coo_array((np.ones(len(start)), (start, end)), shape=(len(mesh.points),) * 2)
     piece = connected_components(links, directed=False)[1]

@@ -105,7 +105,7 @@ class PhantomSpec:
     lateral_radius_mm: float = 20.5
     distal_radius_excess_mm: float = 8.0
     crown_mm: float = 10.0
-    cartilage_mm: float = 2.2
+    cartilage_mm: float = 2.5
     meniscus_height_mm: float = 6.0
     posterior_slope_deg: float = 5.0
     femoral_valgus_deg: float = 5.0

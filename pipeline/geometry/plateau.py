@@ -72,6 +72,8 @@ def _centres(tibia: TriangleMesh, axes: Float, facing_cosine: float) -> tuple[Fl
     local = centres @ axes.T
     top = (face_normals(tibia) @ axes[2] > facing_cosine) & (local[:, 2] > _widest_height(tibia, axes[2]))
     area = triangle_areas(tibia)
+    if not top.any():
+        raise ValueError("no surface of the tibia faces proximally")
     low, high = np.quantile(local[top, 0], [0.01, 0.99])
     middle, gap = 0.5 * (low + high), EMINENCE_SHARE * (high - low)
     medial, lateral = (_centroid(centres, area, top & (s * (local[:, 0] - middle) > gap)) for s in (-1.0, 1.0))
@@ -81,6 +83,8 @@ def _centres(tibia: TriangleMesh, axes: Float, facing_cosine: float) -> tuple[Fl
 def _widest_height(tibia: TriangleMesh, proximal: Float) -> float:
     top = float((tibia.points @ proximal).max())
     sections = cross_sections(tibia, proximal, np.arange(top - 45.0, top - 2.0, 2.0))
+    if not len(sections.areas):
+        raise ValueError("the tibia is too short for cross-sections")
     return float(sections.heights[np.argmax(sections.areas)])
 
 

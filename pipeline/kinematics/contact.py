@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.geometry.containment import contains, piece_points
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.geometry.triangles import near_features, with_neighbours
 from pipeline.kinematics.joint_coordinates import Float, attitude_rotation, rotation_z
@@ -101,14 +102,31 @@ class AttitudeContact:
         """Smallest distance of one compartment at ``pose``, mm; NaN where the body has no such compartment."""
         return self.bodies.compartment_gap(compartment, *self._placement(pose))
 
-    def contacts(self, pose: Pose, band_mm: float) -> Contacts:
+    def nested(self, pose: Pose) -> bool:
+        """Whether one body lies inside the other at ``pose``, where surfaces may not cross at all."""
+        rotation, shift = self._placement(pose)
+        reference, moving = self.bodies.reference, self.bodies.moving
+        placed, taken_back = piece_points(moving) @ rotation.T + shift, (piece_points(reference) - shift) @ rotation
+        return bool(contains(reference, placed).any() or contains(moving, taken_back).any())
+
+    def contacts(self, pose: Pose, band_mm: float, *, along_only: bool = False) -> Contacts:
         """Feature pairs within ``band_mm`` at a pose where the bodies are clear of one another.
 
+        Parameters
+        ----------
+        pose : Pose
+        band_mm : float
+        along_only : bool
+            Leave out walls that a push along delta does not reach: quicker, and enough to choose a motion, which is
+            tested against walls on its way.
+
+        Notes
+        -----
         Candidates are the triangles that cross when the moving body is pushed by about the band. The reaction of a
         feature pair acts along the line between its points: the face normal for vertex on face, the cross product for
         edge on edge; it stays right at ridges and rims where face normals do not.
         """
-        pairs = self._candidates(pose, band_mm)
+        pairs = self._candidates(_pushes(pose, band_mm, along_only=along_only))
         rotation, shift = self._placement(pose)
         reference, moving = self.bodies.reference, self.bodies.moving
         first = reference.points[_patches(reference)[pairs[:, 0]]]
@@ -119,8 +137,8 @@ class AttitudeContact:
         to_attitude = self._reference_from_attitude
         return Contacts(near.on_first[keep] @ to_attitude, normals[keep] @ to_attitude, near.distance[keep])
 
-    def _candidates(self, pose: Pose, band_mm: float) -> NDArray[np.int64]:
-        found = [self.bodies.crossing_pairs(*self._placement(p)) for p in _pushes(pose, band_mm)]
+    def _candidates(self, pushes: list[Pose]) -> NDArray[np.int64]:
+        found = [self.bodies.crossing_pairs(*self._placement(pushed)) for pushed in pushes]
         return np.unique(np.concatenate(found), axis=0)
 
     def _placement(self, pose: Pose) -> tuple[Float, Float]:
@@ -134,13 +152,15 @@ def _patches(mesh: TriangleMesh) -> NDArray[np.int32]:
     return with_neighbours(mesh.triangles)
 
 
-def _pushes(pose: Pose, band_mm: float) -> list[Pose]:
+def _pushes(pose: Pose, band_mm: float, *, along_only: bool) -> list[Pose]:
     """The pose pushed by the band: along delta (twice as far: slopes to 60 deg) and against walls all round.
 
     Triangles that lie wholly inside the other body cross nothing, so on finely faceted surfaces a deep push finds only
     a ring about the contact; the short pushes find what is nearer, down to the contact itself.
     """
     along = [pose._replace(z=pose.z + part * band_mm) for part in (2.0, 0.25, 0.03, 0.004)]
+    if along_only:
+        return along
     turns = np.arange(4) * (np.pi / 2)
     tilted = [
         Pose(pose.x + 1.5 * band_mm * np.cos(a), pose.y + 1.5 * band_mm * np.sin(a), pose.z + 0.5 * band_mm, pose.theta)

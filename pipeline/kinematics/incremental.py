@@ -156,11 +156,11 @@ def solve_incremental(
     Returns
     -------
     StablePose
-        ``NO_CONTACT`` when nothing is met within the travel, ``SLID_OFF`` and ``ROTATION_BOUND`` when the body leaves
-        the bounds, ``NOT_CONVERGED`` when the motions run out.
+        ``NO_CONTACT`` when nothing is met within the travel or one body is inside the other, ``SLID_OFF`` and
+        ``ROTATION_BOUND`` when the body leaves the bounds, ``NOT_CONVERGED`` when the motions run out.
     """
     first = drop(contact, start, settings.motion)
-    if first is None:
+    if first is None or contact.nested(first):
         return StablePose(start, Status.NO_CONTACT, 0, 0)
     search = _Search(contact, settings, centre or first, first, {}, [first])
     search.reset()
@@ -184,7 +184,7 @@ def _out_of_bounds(search: _Search) -> Status | None:
 
 def _round(search: _Search) -> Status | Literal["equilibrium"] | None:
     """What happens at one contact pose: turn, else slide, else equilibrium."""
-    contacts = search.contact.contacts(search.pose, search.settings.contact_band_mm)
+    contacts = search.contact.contacts(search.pose, search.settings.contact_band_mm, along_only=True)
     options = motion_options(contacts, search.pose)
     for kind in KINDS:
         while options[kind] and not search.spent(kind):
@@ -222,7 +222,7 @@ def _accept(search: _Search, kind: Kind, landed: Pose) -> None:
 
 def _classic_round(search: _Search) -> Status | Literal["equilibrium"] | None:
     """The paper's rules without the guard: the first possible motion stands, wherever it leads."""
-    contacts = search.contact.contacts(search.pose, search.settings.contact_band_mm)
+    contacts = search.contact.contacts(search.pose, search.settings.contact_band_mm, along_only=True)
     options = motion_options(contacts, search.pose)
     kind = next((k for k in KINDS if options[k] and not search.spent(k)), None)
     if kind is None:
@@ -269,7 +269,7 @@ def _joint_trials(search: _Search) -> Iterator[Pose]:
     """Joint motions within boxes of halving size; the contacts that matter lie within half the box."""
     p, box = search.pose, 2.0 * search.settings.translation_resolution_mm
     while box >= search.settings.translation_resolution_mm / 8.0:
-        contacts = search.contact.contacts(p, 0.5 * box)
+        contacts = search.contact.contacts(p, 0.5 * box, along_only=True)
         if len(contacts):
             size = (box, box, box / search.settings.motion.radius_mm)
             yield p.displaced(best_motion(reaction_rates(contacts, p), reaction_slack(contacts), size))

@@ -64,7 +64,8 @@ def fit_curves(raw: RawTable, degrees: tuple[int, int]) -> tuple[CurveFit, ...]:
     Raises
     ------
     ValueError
-        When there are fewer usable cells than the degree in flexion needs.
+        When the usable cells are too few for the degrees, or leave out so many values of an angle that the polynomial
+        is free between them.
     """
     usable = raw.poses.status == Status.OK
     p, q = min(degrees[0], raw.grid.shape[0] - 1), min(degrees[1], raw.grid.shape[1] - 1)
@@ -72,6 +73,8 @@ def fit_curves(raw: RawTable, degrees: tuple[int, int]) -> tuple[CurveFit, ...]:
     if usable.sum() < len(terms):
         raise ValueError(f"{int(usable.sum())} usable cells cannot carry a polynomial of {len(terms)} terms")
     design = _design(raw.grid, terms)[usable.ravel()]
+    if np.linalg.matrix_rank(design) < len(terms):
+        raise ValueError(f"the usable cells do not lie so that a polynomial of {len(terms)} terms is determined")
     return tuple(_fit(name, unit, getattr(raw.poses, name)[usable], design, terms) for name, unit in CURVES)
 
 

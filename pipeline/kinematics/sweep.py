@@ -1,8 +1,10 @@
 """The sweep: a stable pose for every attitude of the grid, each started from its neighbour's.
 
-A column is one varus value. From the flexion nearest the scan's own, one arm walks up the column and one down; each
-walks out to its end and back again, so that every cell is reached from both sides: the difference is the hysteresis,
-and the deeper of the two is kept. Arms do not depend on one another, so any number of workers gives the same bytes.
+The *spine* is the column of varus nearest to the scan's own, walked along flexion from the scan upwards and downwards.
+From each of its cells a *rib* walks out in varus to either side, as an examiner would open the knee at a held flexion.
+Every walk goes out to its end and back again: the way out is kept, because it is connected to the scan; the way back
+measures the hysteresis, and steps in only where the way out found nothing. Walks do not depend on one another (ribs
+only on the spine), so any number of workers gives the same bytes.
 """
 
 from __future__ import annotations
@@ -27,14 +29,16 @@ class SweepSettings:
     proof: ProofSettings = field(default_factory=ProofSettings)
 
 
-class Arm(NamedTuple):
-    """One walk over a column: the attitudes in order of the way out, degrees, and the pose to start from."""
+class Walk(NamedTuple):
+    """A walk over neighbouring cells: their (row, column) and their (flexion, varus) in degrees, and the start.
 
-    column: int
-    rows: tuple[int, ...]
-    flexion_deg: tuple[float, ...]
-    varus_deg: float
+    ``centre`` is the middle of the bounds of every cell: the scan pose.
+    """
+
+    cells: tuple[tuple[int, int], ...]
+    attitudes_deg: tuple[tuple[float, float], ...]
     start: Pose
+    centre: Pose
 
 
 class Release(NamedTuple):
@@ -46,43 +50,64 @@ class Release(NamedTuple):
     away: tuple[float, float, float]
 
 
-class ArmResult(NamedTuple):
-    """Cells of one arm in the order of its rows: on the way out and on the way back."""
+class Walked(NamedTuple):
+    """What a walk found, in the order of its cells: on the way out and on the way back."""
 
-    column: int
-    rows: tuple[int, ...]
+    cells: tuple[tuple[int, int], ...]
     out: tuple[Cell, ...]
     back: tuple[Cell, ...]
 
 
-def arms(grid: Grid, scan_flexion_deg: float, scan: Pose) -> tuple[Arm, ...]:
-    """The independent walks that cover the grid, longest first.
+def spine(grid: Grid, scan_flexion_deg: float, scan_varus_deg: float, scan: Pose) -> tuple[Walk, ...]:
+    """Walks along flexion at the varus nearest the scan's, from its nearest flexion up and down; longest first.
 
     Parameters
     ----------
     grid : Grid
-    scan_flexion_deg : float
-        Flexion of the scan; its nearest row is where every column starts.
+    scan_flexion_deg, scan_varus_deg : float
+        Attitude of the scan.
     scan : Pose
         Found coordinates of the scan itself.
     """
-    middle = int(np.argmin(np.abs(grid.flexion_deg - scan_flexion_deg)))
-    up, down = tuple(range(middle, grid.shape[0])), tuple(range(middle, -1, -1))
-    walks = [rows for rows in (up, down) if len(rows) > 1] or [up]
-    built = [
-        Arm(column, rows, tuple(float(grid.flexion_deg[r]) for r in rows), float(varus), scan)
-        for rows in walks
-        for column, varus in enumerate(grid.varus_deg)
-    ]
-    return tuple(sorted(built, key=lambda arm: -len(arm.rows)))
+    row, column = _nearest(grid.flexion_deg, scan_flexion_deg), _nearest(grid.varus_deg, scan_varus_deg)
+    ways = [[(r, column) for r in range(row, grid.shape[0])], [(r, column) for r in range(row - 1, -1, -1)]]
+    walks = [_walk_over(grid, way, scan, scan) for way in ways if way]
+    return tuple(sorted(walks, key=lambda walk: -len(walk.cells)))
 
 
-def walk(bodies: Bodies, arm: Arm, settings: SweepSettings) -> ArmResult:
-    """Solve the cells of one arm outwards and back, each started from the last usable pose."""
-    attitudes = [AttitudeContact(bodies, np.radians(f), np.radians(arm.varus_deg)) for f in arm.flexion_deg]
-    out, last = _pass(attitudes, arm.start, arm.start, settings)
-    back, _ = _pass(attitudes[::-1], last, arm.start, settings)
-    return ArmResult(arm.column, arm.rows, out, back[::-1])
+def ribs(grid: Grid, spine_walked: Sequence[Walked], scan: Pose) -> tuple[Walk, ...]:
+    """Walks along varus from every cell of the spine, to either side.
+
+    A rib whose own cell of the spine failed starts from the nearest row that did not; none can start where all failed.
+    """
+    starts = {at: cell.pose for at, cell in _kept(spine_walked).items() if cell.status.usable}
+    if not starts:
+        return ()
+    column = next(iter(starts))[1]
+    walks = []
+    for row in range(grid.shape[0]):
+        start = starts[min(starts, key=lambda at: (abs(at[0] - row), at[0]))]
+        for way in (range(column + 1, grid.shape[1]), range(column - 1, -1, -1)):
+            if way:
+                walks.append(_walk_over(grid, [(row, c) for c in way], start, scan))
+    return tuple(walks)
+
+
+def _nearest(values: Float, wanted: float) -> int:
+    return int(np.argmin(np.abs(values - wanted)))
+
+
+def _walk_over(grid: Grid, cells: Sequence[tuple[int, int]], start: Pose, centre: Pose) -> Walk:
+    attitudes = [(float(grid.flexion_deg[row]), float(grid.varus_deg[column])) for row, column in cells]
+    return Walk(tuple(cells), tuple(attitudes), start, centre)
+
+
+def go(bodies: Bodies, walk: Walk, settings: SweepSettings) -> Walked:
+    """Solve the cells of one walk outwards and back, each started from the last usable pose."""
+    contacts = [AttitudeContact(bodies, np.radians(f), np.radians(v)) for f, v in walk.attitudes_deg]
+    out, last = _pass(contacts, walk.start, walk.centre, settings)
+    back, _ = _pass(contacts[::-1], last, walk.centre, settings)
+    return Walked(walk.cells, out, back[::-1])
 
 
 def let_go(bodies: Bodies, release: Release, settings: SweepSettings) -> StablePose:
@@ -109,18 +134,15 @@ def _cell(contact: AttitudeContact, solved: StablePose, settings: SweepSettings)
     return measured_cell(contact, solved.pose, solved.status, settings.proof, solved.motions)
 
 
-def assemble(grid: Grid, results: Sequence[ArmResult]) -> RawTable:
-    """The raw table of a whole grid from its arms; the deeper of the two passes is kept, the way out on a tie."""
-    kept: dict[tuple[int, int], Cell] = {}
+def assemble(grid: Grid, walked: Sequence[Walked]) -> RawTable:
+    """The raw table of a whole grid from its walks; cells that no walk reached are NOT_CONVERGED."""
+    kept = _kept(walked)
+    unreached = failed_cell(Status.NOT_CONVERGED)
+    cells = [[kept.get((row, column), unreached) for column in range(grid.shape[1])] for row in range(grid.shape[0])]
     hysteresis_mm, hysteresis_deg = np.full(grid.shape, np.nan), np.full(grid.shape, np.nan)
-    for result in results:
-        for row, out, back in zip(result.rows, result.out, result.back, strict=True):
-            at = (row, result.column)
-            hysteresis_mm[at], hysteresis_deg[at] = _worst(hysteresis_mm[at], hysteresis_deg[at], out, back)
-            for cell in (out, back):
-                if at not in kept or _better(cell, kept[at]):
-                    kept[at] = cell
-    cells = [[kept[(row, column)] for column in range(grid.shape[1])] for row in range(grid.shape[0])]
+    for walk in walked:
+        for at, out, back in zip(walk.cells, walk.out, walk.back, strict=True):
+            hysteresis_mm[at], hysteresis_deg[at] = _difference(out, back)
     return RawTable(
         grid=grid,
         poses=pose_table(cells),
@@ -132,17 +154,18 @@ def assemble(grid: Grid, results: Sequence[ArmResult]) -> RawTable:
     )
 
 
-def _better(cell: Cell, held: Cell) -> bool:
-    if cell.status.usable != held.status.usable:
-        return cell.status.usable
-    return cell.status.usable and cell.pose.z > held.pose.z
+def _kept(walked: Sequence[Walked]) -> dict[tuple[int, int], Cell]:
+    return {
+        at: back if back.status.usable and not out.status.usable else out
+        for walk in walked
+        for at, out, back in zip(walk.cells, walk.out, walk.back, strict=True)
+    }
 
 
-def _worst(mm: float, deg: float, out: Cell, back: Cell) -> tuple[float, float]:
-    """The larger of what is known and what these two passes differ by (NaN when not both are usable)."""
+def _difference(out: Cell, back: Cell) -> tuple[float, float]:
+    """Shift (mm) and rotation (deg) between two passes; NaN when not both are usable."""
     difference = np.subtract(out.pose, back.pose)
-    way, turn = float(np.linalg.norm(difference[:3])), float(np.degrees(abs(difference[3])))
-    return float(np.fmax(mm, way)), float(np.fmax(deg, turn))
+    return float(np.linalg.norm(difference[:3])), float(np.degrees(abs(difference[3])))
 
 
 def pose_table(cells: Sequence[Sequence[Cell]]) -> PoseTable:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from pipeline.kinematics.joint_coordinates import JointCoordinates, joint_coordi
 from pipeline.records import Anatomy, AxisEstimate, CaseFacts, Landmark, Matrix, Side, Vector
 
 Float = NDArray[np.float64]
+Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 
 
 class Params(StrictParams):
@@ -35,10 +36,10 @@ class Params(StrictParams):
     delta: list[float] | None = Field(
         None, min_length=3, max_length=3, description="direction of the push in scan space (LPS), instead of a rule"
     )
-    scan_from_reference: list[list[float]] | None = Field(
+    scan_from_reference: list[Row] | None = Field(
         None, description="4x4 frame of the reference body in scan space, with method given"
     )
-    scan_from_moving: list[list[float]] | None = Field(
+    scan_from_moving: list[Row] | None = Field(
         None, description="4x4 frame of the moving body in scan space, z along delta, with method given"
     )
     max_flexion_axis_uncertainty_deg: float = Field(

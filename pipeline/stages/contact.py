@@ -37,8 +37,8 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     present = [name for name in (*params.reference, *params.moving) if name in facts.structures]
     if facts.source == "meshes":
         meshes = reads[MESHES]
-        out[REFERENCE_BODY] = _of_meshes(meshes, params.reference)
-        out[MOVING_BODY] = _of_meshes(meshes, params.moving)
+        out[REFERENCE_BODY] = _of_meshes(meshes, params.reference, "reference")
+        out[MOVING_BODY] = _of_meshes(meshes, params.moving, "moving")
         findings: Findings = ()
     else:
         findings = _of_labels(reads, params, out)
@@ -46,8 +46,19 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     return findings + _missing_surfaces(params, present)
 
 
-def _of_meshes(meshes: Mapping[str, TriangleMesh], names: list[str]) -> TriangleMesh:
-    return merged([meshes[name] for name in names if name in meshes])
+def _of_meshes(meshes: Mapping[str, TriangleMesh], names: list[str], body: str) -> TriangleMesh:
+    try:
+        return merged([meshes[name] for name in names if name in meshes])
+    except ValueError as error:
+        raise _no_surface(body, error) from error
+
+
+def _no_surface(body: str, error: ValueError) -> CaseRejected:
+    return CaseRejected(
+        "E-CON-01",
+        f"The {body} contact body has no closed surface: {error}.",
+        "Look at its labels for holes and loose voxels.",
+    )
 
 
 def _of_labels(reads: Inputs, params: Params, out: Outputs) -> Findings:
@@ -73,11 +84,7 @@ def _surface(mask: Mask, other: Mask, labels: LabelVolume, settings: SurfaceSett
     try:
         return mask_to_mesh(mask, labels.lps_from_index, settings, keep_out=other)
     except ValueError as error:
-        raise CaseRejected(
-            "E-CON-01",
-            f"The {name} contact body has no closed surface: {error}.",
-            "Look at its labels for holes and loose voxels.",
-        ) from error
+        raise _no_surface(name, error) from error
 
 
 def _described(name: str, result: SurfaceResult) -> Finding:

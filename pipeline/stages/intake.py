@@ -1,7 +1,6 @@
-"""Stage 10, intake: the only place that touches foreign files.
+"""Stage 10, intake: foreign files become one canonical label volume (or named meshes) in LPS, or are refused.
 
-It turns whatever the case brought into one canonical label volume (or named meshes) in LPS millimetres, and refuses,
-with the reason, what cannot be trusted. Later stages never see a foreign file.
+The only stage that sees a foreign file.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Self
 
@@ -15,7 +16,7 @@ from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, 
 from pipeline.errors import CaseRejected
 from pipeline.kinematics.body_frames import scan_pose
 from pipeline.kinematics.incremental import IncrementalSettings, StablePose
-from pipeline.kinematics.sweep import Release, SweepSettings, arms, assemble, let_go, walk
+from pipeline.kinematics.sweep import Release, SweepSettings, Walk, assemble, go, let_go, ribs, spine
 from pipeline.kinematics.table import Grid, RawTable, Status
 from pipeline.records import Anatomy, ScanReturn
 
@@ -36,7 +37,7 @@ class Params(ContactParams):
     rotation_step_deg: float = Field(1.0, gt=0, le=45, description="step of rotations about delta")
     rotation_resolution_deg: float = Field(0.1, gt=0, le=5, description="step at which a rotation is spent")
     slide_bound_mm: float = Field(30.0, gt=0, le=200, description="farther than this from the scan pose: slid off")
-    rotation_bound_deg: float = Field(45.0, gt=0, le=179, description="farther than this from the scan pose: bound")
+    rotation_bound_deg: float = Field(30.0, gt=0, le=179, description="farther than this from the scan pose: bound")
     max_motions: int = Field(400, ge=10, le=100_000, description="motions after which a cell is not converged")
     scan_shift_mm: float = Field(
         2.0, ge=0, le=20, description="how far from the scan pose the body is let go, as a test"
@@ -46,14 +47,16 @@ class Params(ContactParams):
 
     @model_validator(mode="after")
     def _grid_is_whole(self) -> Self:
+        cells = 1
         for name in ("flexion", "varus"):
             low, high, step = (getattr(self, f"{name}_{part}_deg") for part in ("min", "max", "step"))
             if high < low:
                 raise ValueError(f"{name}_max_deg {high} is below {name}_min_deg {low}")
             if abs((high - low) / step - round((high - low) / step)) > 1e-9:
                 raise ValueError(f"{name}_step_deg {step} does not divide the range {low} to {high}")
-        if np.prod(self.grid().shape) > MAX_CELLS:
-            raise ValueError(f"the grid has {np.prod(self.grid().shape)} cells, at most {MAX_CELLS}")
+            cells *= round((high - low) / step) + 1
+        if cells > MAX_CELLS:
+            raise ValueError(f"the grid has {cells} cells, at most {MAX_CELLS}")
         return self
 
     def grid(self) -> Grid:
@@ -72,16 +75,12 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     """Sweep the grid."""
     anatomy, grid = reads[ANATOMY], params.grid()
     pair = params.pair(reads[REFERENCE_BODY], reads[MOVING_BODY], anatomy)
-    tasks = arms(grid, anatomy.scan_attitude[0], scan_pose(anatomy.scan_attitude))
-    total, finished = sum(len(task.rows) for task in tasks), 0
-
-    def done(index: int) -> None:
-        nonlocal finished
-        finished += len(tasks[index].rows)
-        out.progress(finished, total)
-
-    work = partial(walk, settings=_settings(params))
-    table = assemble(grid, map_contact(work, tasks, pair, out.jobs, done))
+    scan, progress = scan_pose(anatomy.scan_attitude), _Progress(out, int(np.prod(grid.shape)))
+    work = partial(go, settings=_settings(params))
+    first = spine(grid, anatomy.scan_attitude[0], anatomy.scan_attitude[1], scan)
+    along = map_contact(work, first, pair, out.jobs, progress.of(first))
+    across = ribs(grid, along, scan)
+    table = assemble(grid, [*along, *map_contact(work, across, pair, out.jobs, progress.of(across))])
     if not (table.poses.status == Status.OK).any():
         raise CaseRejected(
             "E-SWP-01",
@@ -117,6 +116,22 @@ def _scan_return(release: Release, stable: StablePose) -> ScanReturn:
         rotation_deg=float(np.degrees(abs(turn))),
         sinking_mm=float(dz),
     )
+
+
+class _Progress:
+    """Cells done out of all, told as walks finish."""
+
+    def __init__(self, out: Outputs, total: int) -> None:
+        self.out, self.total, self.finished = out, total, 0
+
+    def of(self, walks: Sequence[Walk]) -> Callable[[int], None]:
+        """What to call with the index of each finished walk."""
+
+        def done(index: int) -> None:
+            self.finished += len(walks[index].cells)
+            self.out.progress(self.finished, self.total)
+
+        return done
 
 
 def _settings(params: Params) -> SweepSettings:

@@ -112,18 +112,20 @@ def test_an_oblique_grid_and_flat_voxels_show_the_same_knee(volume: LabelVolume)
     np.testing.assert_allclose(volumes_mm3(oblique)[joint], volumes_mm3(volume)[joint], rtol=0.04)
     for name in ("patella", *SEAT):
         apart = lps_mm(oblique, name).mean(axis=0) - lps_mm(volume, name).mean(axis=0)
-        assert np.linalg.norm(apart) < 0.3
+        assert np.linalg.norm(apart) < 0.5  # half a voxel: a thin sheet along the square grid can be off by that
 
 
-def test_volumes_converge_with_the_voxels(volume: LabelVolume, coarse: LabelVolume) -> None:
-    fine = volumes_mm3(phantom_labels(replace(SPEC, spacing_mm=(0.75, 0.75, 0.75), shaft_length_mm=5.0)))
+def test_volumes_converge_with_the_voxels() -> None:
     # femur, tibia and fibula end at the border, which lies on the grid
     closed = [value - 1 for name, value in PHANTOM_LABELS.items() if name not in ("femur", "tibia", "fibula")]
-    coarse_error = np.abs(volumes_mm3(coarse) / fine - 1.0)[closed]
-    error = np.abs(volumes_mm3(volume) / fine - 1.0)[closed]
-    assert coarse_error.max() < 0.08
-    assert error.max() < 0.03
-    assert error.mean() < coarse_error.mean()
+    # an oblique grid: a sheet along a square one gains or loses whole layers
+    spec = PhantomSpec(shaft_length_mm=5.0)
+    coarse, middle, fine = (
+        volumes_mm3(phantom_labels(replace(spec, spacing_mm=(size,) * 3)))[closed] for size in (2.4, 1.1, 0.75)
+    )
+    coarse_error, error = np.abs(coarse / fine - 1.0), np.abs(middle / fine - 1.0)
+    assert error.max() < 0.02
+    assert error.mean() < coarse_error.mean() / 2
 
 
 def test_scale_acts_on_everything() -> None:

@@ -10,7 +10,7 @@ import pytest
 from pipeline.geometry.containment import nested
 from pipeline.geometry.validation_objects import BallInDish, BarOnPyramids, ball, box, dish
 from pipeline.kinematics.certificate import equilibrium_residual
-from pipeline.kinematics.contact import AttitudeContact, Pose
+from pipeline.kinematics.contact import AttitudeContact, Contacts, Pose
 from pipeline.kinematics.descent import drop
 from pipeline.kinematics.incremental import StablePose, solve_incremental
 from pipeline.kinematics.table import Status
@@ -207,9 +207,9 @@ class Recorded(AttitudeContact):
         super().__init__(other.bodies, 0.0, 0.0)
         self.stood: list[Pose] = []
 
-    def contacts(self, pose: Pose, band_mm: float):  # type: ignore[no-untyped-def]  # as the parent
+    def contacts(self, pose: Pose, band_mm: float, *, along_only: bool = False) -> Contacts:
         self.stood.append(pose)
-        return super().contacts(pose, band_mm)
+        return super().contacts(pose, band_mm, along_only=along_only)
 
 
 @stepping

@@ -1,0 +1,93 @@
+"""A coarse phantom knee run for real, and comparisons of what runs leave."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.artifacts import RAW_TABLE, SMOOTH_TABLE
+from pipeline.config import load_settings
+from pipeline.engine.outcome import Execution, RunOutcome
+from pipeline.engine.runner import CaseJob, run_case
+from pipeline.engine.stage import Stage
+from pipeline.files.phantom_case import write_phantom_case
+from pipeline.flow import FLOW
+from pipeline.geometry.phantom_spec import PhantomSpec
+from pipeline.kinematics.table import PoseTable
+
+#: Up to the smoothed table: the numbers, without pictures and package.
+NUMBERS = FLOW[:6]
+
+#: A grid and meshes small enough for a test, coarse enough to be quick.
+COARSE = (
+    "contact.triangles=6000",
+    "mesh.triangles_of={femur: 6000, tibia: 6000}",
+    "mesh.triangles=3000",
+    "mesh.volume_tolerance_fraction=0.08",
+    "sweep.flexion_max_deg=30.0",
+    "sweep.flexion_step_deg=10.0",
+    "sweep.varus_min_deg=-2.0",
+    "sweep.varus_max_deg=2.0",
+    "sweep.scan_shift_mm=1.0",
+    "qa.pictures.panel_px=240",
+)
+SPACING_MM = (1.0, 1.0, 1.0)
+
+#: Written anew by every run: records of the run itself, not results.
+RECORDS = frozenset({"stage.json", "run.json", "log.jsonl", ".lock"})
+
+
+class Silent:
+    """A listener that says nothing."""
+
+    def stage_started(self, stage: str, index: int, total: int, reason: str) -> None: ...
+
+    def stage_progress(self, stage: str, done: int, total: int) -> None: ...
+
+    def stage_finished(self, outcome: object, index: int, total: int) -> None: ...
+
+
+def phantom_case(cases: Path, name: str, spec: PhantomSpec | None = None) -> Path:
+    """A case folder with a phantom knee."""
+    write_phantom_case(cases / name, spec or PhantomSpec(spacing_mm=SPACING_MM))
+    return cases / name
+
+
+def run(
+    case: Path, results: Path, flow: Sequence[Stage] = NUMBERS, jobs: int = 1, more: Sequence[str] = ()
+) -> RunOutcome:
+    """Process a case with the coarse settings; results go to ``results/<ID>``."""
+    settings = load_settings(FLOW, case, "clinical", (*COARSE, *more))
+    job = CaseJob(case.name, case, results / case.name)
+    return run_case(job, flow, settings, Execution(jobs=jobs), Silent())
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    """Every result below a folder: relative name -> bytes."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name not in RECORDS
+    }
+
+
+def poses(results: Path) -> tuple[PoseTable, PoseTable]:
+    """Raw and smoothed poses of a case's results."""
+    raw = RAW_TABLE.decode({"": (results / "60_sweep" / RAW_TABLE.file).read_bytes()})
+    smooth = SMOOTH_TABLE.decode({"": (results / "70_smooth" / SMOOTH_TABLE.file).read_bytes()})
+    return raw.poses, smooth.poses
+
+
+def largest_difference(first: PoseTable, second: PoseTable) -> tuple[float, float]:
+    """Of the coordinates: mm, deg."""
+    shifts = [_most(first.lateral_mm, second.lateral_mm), _most(first.anterior_mm, second.anterior_mm)]
+    shifts.append(_most(first.proximal_mm, second.proximal_mm))
+    return max(shifts), _most(first.internal_rotation_deg, second.internal_rotation_deg)
+
+
+def _most(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    assert np.array_equal(np.isnan(first), np.isnan(second))
+    return float(np.nanmax(np.abs(first - second)))
