@@ -26,6 +26,9 @@ class Params(ContactParams):
 
     degree_flexion: int = Field(6, ge=0, le=20, description="degree in flexion (the paper's 6)")
     degree_varus: int = Field(2, ge=0, le=6, description="degree in varus")
+    fill_gap_deg: float = Field(
+        25.0, ge=0, le=180, description="failed cells between usable ones at most this far apart are smoothed over"
+    )
 
 
 def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
@@ -39,7 +42,7 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
         ) from error
     pair = params.pair(reads[REFERENCE_BODY], reads[MOVING_BODY], anatomy)
     settled = partial(settle, motion=params.motion(), proof=params.proof())
-    cells = _in_rows(map_contact(settled, entries(raw, fits), pair, out.jobs), raw.grid)
+    cells = _in_rows(map_contact(settled, entries(raw, fits, params.fill_gap_deg), pair, out.jobs), raw.grid)
     poses = pose_table(cells)
     out[SMOOTH_TABLE] = SmoothTable(
         grid=raw.grid,
@@ -86,7 +89,9 @@ def _findings(poses: PoseTable) -> Findings:
     filled = int((poses.status == Status.SMOOTHED).sum())
     if not filled:
         return ()
-    message = f"{filled} attitudes without a stable pose were smoothed over from both neighbours in flexion."
+    message = (
+        f"{filled} attitudes without a stable pose were smoothed over: the curves through their neighbours, in contact."
+    )
     return (Finding("N-SMO-01", Severity.NOTE, message),)
 
 

@@ -21,7 +21,16 @@ from pipeline.flow import FLOW
 from pipeline.geometry.phantom_spec import PhantomSpec
 from pipeline.kinematics.table import Status
 from pipeline.playback import Lut
-from tests.end_to_end.knee_runs import COARSE, SPACING_MM, files_of, largest_difference, phantom_case, poses, run
+from tests.end_to_end.knee_runs import (
+    COARSE,
+    SPACING_MM,
+    files_of,
+    largest_difference,
+    mirrored_case,
+    phantom_case,
+    poses,
+    run,
+)
 
 CHECK_PACKAGE = Path(__file__).resolve().parents[3] / "shared" / "tools" / "check_package.py"
 
@@ -96,8 +105,7 @@ def test_workers_do_not_change_a_byte(done: Done, tmp_path: Path, jobs: int) -> 
 
 
 def test_the_mirrored_knee_gives_the_mirrored_table(done: Done, tmp_path: Path) -> None:
-    left = phantom_case(tmp_path / "cases", "left", PhantomSpec(side="left", spacing_mm=SPACING_MM))
-    run(left, tmp_path / "results")
+    run(mirrored_case(tmp_path / "cases", "left"), tmp_path / "results")
     for mine, other in zip(poses(done.results), poses(tmp_path / "results" / "left"), strict=True):
         assert max(largest_difference(mine, other)) < 1e-6
 
@@ -143,7 +151,7 @@ def test_killed_in_every_stage_the_run_resumes_to_the_same_bytes(done: Done, tmp
         "1",
         *overrides,
     ]
-    command = [sys.executable, "-P", "-m", "pipeline.cli", *arguments]
+    command = [sys.executable, "-P", "-c", "from pipeline.cli import main; main()", *arguments]
     kills = 0
     for stage in FLOW:
         kills += _killed_once_begun(command, tmp_path / "right", stage.folder)

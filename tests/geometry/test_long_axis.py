@@ -19,7 +19,9 @@ def bone(shaft_mm: float, cut_deg: float = 0.0, sectors: int = 64) -> TriangleMe
     """A flare of 40 mm radius that narrows to a shaft of 12 mm over 40 mm; its cap is tilted by ``cut_deg``."""
     top = 40.0 + shaft_mm
     rings = np.linspace(40.0, top, 12)[:-1]
-    profile = np.vstack([[[0, 0], [40, 0], [40, 10]], np.column_stack([np.full(11, 12.0), rings]), [[12, top], [0, top]]])
+    profile = np.vstack(
+        [[[0, 0], [40, 0], [40, 10]], np.column_stack([np.full(11, 12.0), rings]), [[12, top], [0, top]]]
+    )
     made = revolved(profile, sectors)
     end = made.points[:, 2] == top
     tilted = made.points.copy()
