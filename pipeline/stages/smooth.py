@@ -18,14 +18,17 @@ from pipeline.kinematics.contact import Bodies, Pose
 from pipeline.kinematics.interpolation import found_at, pose_curves
 from pipeline.kinematics.smoothing import Probe, ends, entries, fit_curves, settle, way_to_contact
 from pipeline.kinematics.sweep import pose_table
-from pipeline.kinematics.table import Float, Grid, PoseTable, SmoothTable, Status
+from pipeline.kinematics.table import Float, Grid, PoseTable, RawTable, SmoothTable, Status
 
 
 class Params(ContactParams):
     """Degrees of the polynomials and how the result is proven."""
 
     degree_flexion: int = Field(6, ge=0, le=20, description="degree in flexion (the paper's 6)")
-    degree_varus: int = Field(2, ge=0, le=6, description="degree in varus")
+    degree_varus: int = Field(2, ge=0, le=6, description="degree in varus, lowered until midpoints hold their limit")
+    midpoint_limit_mm: float = Field(
+        0.145, gt=0, le=10, description="gap or overlap allowed half-way between entries (one arc minute at 0.5 m)"
+    )
     fill_gap_deg: float = Field(
         25.0, ge=0, le=180, description="failed cells between usable ones at most this far apart are smoothed over"
     )
@@ -34,17 +37,32 @@ class Params(ContactParams):
 def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     """Smooth the table and prove it."""
     raw, anatomy = reads[RAW_TABLE], reads[ANATOMY]
+    pair = params.pair(reads[REFERENCE_BODY], reads[MOVING_BODY], anatomy)
+    wanted = min(params.degree_varus, raw.grid.shape[1] - 1)
+    table = _smoothed(raw, wanted, params, pair, out)
+    degree = wanted
+    for lower in range(wanted - 1, -1, -1):
+        if _worst_midpoint(table) <= params.midpoint_limit_mm:
+            break
+        trial = _smoothed(raw, lower, params, pair, out)
+        if _worst_midpoint(trial) < _worst_midpoint(table):
+            table, degree = trial, lower
+    out[SMOOTH_TABLE] = table
+    return _findings(table, wanted, degree)
+
+
+def _smoothed(raw: RawTable, degree_varus: int, params: Params, pair: ContactPair, out: Outputs) -> SmoothTable:
+    """The table with curves of one degree in varus, in contact and tested."""
     try:
-        fits = fit_curves(raw, (params.degree_flexion, params.degree_varus))
+        fits = fit_curves(raw, (params.degree_flexion, degree_varus))
     except ValueError as error:
         raise CaseRejected(
             "E-SMO-01", f"The curves cannot be smoothed: {error}.", "Narrow the range of angles or lower the degree."
         ) from error
-    pair = params.pair(reads[REFERENCE_BODY], reads[MOVING_BODY], anatomy)
     settled = partial(settle, motion=params.motion(), proof=params.proof())
     cells = _in_rows(map_contact(settled, entries(raw, fits, params.fill_gap_deg), pair, out.jobs), raw.grid)
     poses = pose_table(cells)
-    out[SMOOTH_TABLE] = SmoothTable(
+    return SmoothTable(
         grid=raw.grid,
         poses=poses,
         fits=fits,
@@ -53,7 +71,11 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
         contact_error_mm=np.array([[_contact_error(cell) for cell in row] for row in cells]),
         midpoint_error_mm=_midpoint_errors(raw.grid, poses, partial(way_to_contact, motion=params.motion()), pair, out),
     )
-    return _findings(poses)
+
+
+def _worst_midpoint(table: SmoothTable) -> float:
+    known = np.abs(table.midpoint_error_mm[np.isfinite(table.midpoint_error_mm)])
+    return float(known.max(initial=0.0))
 
 
 def _in_rows(cells: list[Cell], grid: Grid) -> list[list[Cell]]:
@@ -85,14 +107,18 @@ def _probe(attitude: Float, found: Float) -> Probe:
     return Probe(float(attitude[0]), float(attitude[1]), Pose(x, y, z, float(np.radians(turn))))
 
 
-def _findings(poses: PoseTable) -> Findings:
-    filled = int((poses.status == Status.SMOOTHED).sum())
-    if not filled:
-        return ()
-    message = (
-        f"{filled} attitudes without a stable pose were smoothed over: the curves through their neighbours, in contact."
-    )
-    return (Finding("N-SMO-01", Severity.NOTE, message),)
+def _findings(table: SmoothTable, wanted: int, degree: int) -> Findings:
+    out = []
+    filled = int((table.poses.status == Status.SMOOTHED).sum())
+    if filled:
+        message = (
+            f"{filled} attitudes without a stable pose were smoothed over: the curves of their neighbours, in contact."
+        )
+        out.append(Finding("N-SMO-01", Severity.NOTE, message))
+    if degree < wanted:
+        message = f"Degree {degree} instead of {wanted} in varus, so that contact holds between the entries as well."
+        out.append(Finding("N-SMO-02", Severity.NOTE, message))
+    return tuple(out)
 
 
 STAGE = Stage(70, "smooth", (ANATOMY, REFERENCE_BODY, MOVING_BODY, RAW_TABLE), (SMOOTH_TABLE,), Params, run)

@@ -152,7 +152,10 @@ def _settings(params: Params) -> SweepSettings:
 
 def _counts(table: RawTable) -> str:
     values, counts = np.unique(table.poses.status, return_counts=True)
-    return ", ".join(f"{count} {Status(int(value)).name.lower()}" for value, count in zip(values, counts, strict=True))
+    return ", ".join(
+        f"{count} {Status(int(value)).name.lower().replace('_', ' ')}"
+        for value, count in zip(values, counts, strict=True)
+    )
 
 
 def _findings(table: RawTable) -> Findings:

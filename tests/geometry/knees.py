@@ -14,6 +14,7 @@ from pipeline.geometry.phantom import PHANTOM_LABELS, PhantomTruth, phantom_labe
 from pipeline.geometry.phantom_spec import PhantomSpec
 from pipeline.geometry.validation_objects import revolved
 from pipeline.kinematics.joint_coordinates import rotation_x, rotation_y, rotation_z
+from tests.kinematics.shapes import shifted
 
 SPEC = PhantomSpec(
     spacing_mm=(1.4, 1.4, 1.4),
@@ -59,8 +60,8 @@ def sphere_femur(
     """
     medial = sphere(21.0)
     medial = TriangleMesh(medial.points * [1.0, stretch, 1.0] + medial_mm, medial.triangles)
-    shaft = revolved(np.array([[0.0, 30.0], [14.0, 30.0], [14.0, 110.0], [0.0, 110.0]]), 24)
-    return merged([medial, sphere(19.0, lateral_mm), TriangleMesh(shaft.points + [0.0, 8.0, 0.0], shaft.triangles)])
+    shaft = shifted(revolved(np.array([[0.0, 30.0], [14.0, 30.0], [14.0, 110.0], [0.0, 110.0]]), 24), y=8.0)
+    return merged([medial, sphere(19.0, lateral_mm), shaft])
 
 
 def about(x_deg: float, y_deg: float, z_deg: float) -> Float:

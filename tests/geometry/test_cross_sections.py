@@ -12,7 +12,7 @@ from pipeline.geometry.mesh import Float, TriangleMesh, merged, transformed
 from pipeline.geometry.validation_objects import revolved
 from tests.geometry.knees import about
 from tests.geometry.meshes import torus
-from tests.kinematics.shapes import convex
+from tests.kinematics.shapes import convex, shifted
 
 Z = np.array([0.0, 0.0, 1.0])
 SECTORS = 24
@@ -65,14 +65,10 @@ def test_the_hole_of_a_torus_is_taken_away() -> None:
 
 
 def test_two_bodies_have_the_centroid_of_both_weighted_by_area() -> None:
-    pair = merged([cylinder(10.0, 20.0), TriangleMesh(cylinder(5.0, 20.0).points + [40.0, 0.0, 0.0], _triangles())])
+    pair = merged([cylinder(10.0, 20.0), shifted(cylinder(5.0, 20.0), x=40.0)])
     cuts = cross_sections(pair, Z, np.array([10.0]))
     assert cuts.areas[0] == pytest.approx(POLYGON * 125.0)
     np.testing.assert_allclose(cuts.centroids[0], [40.0 * 25.0 / 125.0, 0.0, 10.0], rtol=0, atol=1e-12)
-
-
-def _triangles() -> np.ndarray[tuple[int, int], np.dtype[np.int32]]:
-    return cylinder(5.0, 20.0).triangles
 
 
 @pytest.mark.parametrize("seed", range(4))

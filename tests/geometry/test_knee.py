@@ -1,4 +1,4 @@
-"""The anatomy of a whole knee: against the phantom's truth, mirrored, moved, with landmarks given, and on a real one."""
+"""The anatomy of a whole knee: against the phantom's truth, mirrored, moved, with given landmarks, and a real one."""
 
 from __future__ import annotations
 
@@ -185,11 +185,12 @@ def test_given_hip_and_ankle_are_the_mechanical_axes(knee: Knee, found: KneeAnat
 
 def test_the_hip_is_taken_before_the_shaft(knee: Knee, found: KneeAnatomy) -> None:
     centre = found.scan_from_femur[:3, 3]
-    both = {"femoral_head_centre": centre + [5.0, 0.0, 400.0], "femur_shaft_centre": centre + [0.0, 9.0, 90.0]}
+    hip, shaft_mm = np.array([5.0, 0.0, 400.0]), np.array([0.0, 9.0, 90.0])
+    both = {"femoral_head_centre": centre + hip, "femur_shaft_centre": centre + shaft_mm}
     given = knee_anatomy(knee, 1.0, both)
     assert given.axes["femoral_long_axis"].method == "from the joint to the given femoral head centre"
     shaft = knee_anatomy(knee, 1.0, {"femur_shaft_centre": both["femur_shaft_centre"]})
-    np.testing.assert_allclose(shaft.axes["femoral_long_axis"].direction, unit(np.array([0.0, 9.0, 90.0])), atol=1e-12)
+    np.testing.assert_allclose(shaft.axes["femoral_long_axis"].direction, unit(shaft_mm), atol=1e-12)
 
 
 def test_given_plateau_centres_are_the_tibial_frame(knee: Knee, truth: PhantomTruth) -> None:

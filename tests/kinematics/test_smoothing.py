@@ -157,7 +157,9 @@ def test_a_grid_of_one_attitude_keeps_its_value() -> None:
     fits = fit_curves(raw, (6, 2))
     assert [float(evaluate(fit, grid)[0, 0]) for fit in fits] == pytest.approx([2.5, 2.5, 2.5])
     (entry,) = entries(raw, fits, 25.0)
-    assert entry == (0, 0, 30.0, 1.0, pytest.approx((2.5, 2.5, 2.5, np.radians(2.5))), Status.OK)
+    assert entry[:4] == (0, 0, 30.0, 1.0)
+    assert entry.start == pytest.approx((2.5, 2.5, 2.5, np.radians(2.5)))
+    assert entry.status is Status.OK
 
 
 def test_scaling_takes_the_ends_to_minus_one_and_one() -> None:

@@ -1,0 +1,145 @@
+"""Stage 70 on a joint whose poses are known: contact in every entry, midpoints measured."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.artifacts import ANATOMY, MOVING_BODY, RAW_TABLE, REFERENCE_BODY, SMOOTH_TABLE
+from pipeline.engine.stage import Findings, Severity
+from pipeline.errors import CaseRejected
+from pipeline.kinematics.cell import Cell, ProofSettings, measured_cell
+from pipeline.kinematics.contact import AttitudeContact, Bodies
+from pipeline.kinematics.descent import MotionSettings
+from pipeline.kinematics.smoothing import Entry, settle
+from pipeline.kinematics.table import Float, Grid, PoseTable, RawTable, Status
+from pipeline.stages.smooth import STAGE, Params
+from tests.kinematics.hollow_joint import FACETS_MM, REST_MM, ball, hollow
+from tests.stages.in_memory import Run, anatomy
+
+GRID = Grid(np.linspace(0.0, 40.0, 9), np.array([-2.0, 0.0, 2.0]))
+PARAMS = Params(degree_flexion=3, eminence_mm=1.0)
+
+
+def wandering() -> tuple[Float, Float, Float]:
+    """Places of the ball that are polynomials of the attitude: x and y in mm, rotation in degrees."""
+    u, v = np.meshgrid(GRID.flexion_deg / 20.0 - 1.0, GRID.varus_deg / 2.0, indexing="ij")
+    return 1.0 * u + 0.3 * v, 0.5 - 0.8 * u**2 + 0.1 * u * v, 6.0 * u**3 - 2.0 * v
+
+
+def raw_table(grid: Grid, failed: list[tuple[int, int]], offset_mm: float = 0.0) -> RawTable:
+    """The ball resting at those places (z by the spheres' formula), with cells that failed."""
+    x, y, rotation = (part[: grid.shape[0], : grid.shape[1]].copy() for part in wandering())
+    z = np.sqrt(REST_MM**2 - x**2 - y**2) + offset_mm
+    status, zeros = np.zeros(grid.shape, dtype=np.uint8), np.zeros(grid.shape)
+    for cell in failed:
+        status[cell] = Status.NOT_CONVERGED
+        x[cell] = y[cell] = z[cell] = rotation[cell] = np.nan
+    counts = np.zeros(grid.shape, dtype=np.int32)
+    poses = PoseTable(x, y, z, rotation, status, zeros, zeros, zeros, counts)
+    return RawTable(grid, poses, counts, zeros, zeros, zeros, zeros)
+
+
+def smoothed(raw: RawTable, params: Params = PARAMS) -> tuple[Run, Findings]:
+    given: dict[str, Any] = {
+        REFERENCE_BODY.name: hollow(),
+        MOVING_BODY.name: ball(),
+        ANATOMY.name: anatomy(np.eye(4), np.eye(4), (0.0,) * 6),
+        RAW_TABLE.name: raw,
+    }
+    run = Run(STAGE, given)
+    return run, run.go(params)
+
+
+@pytest.fixture(scope="module")
+def made() -> tuple[Run, Findings]:
+    return smoothed(raw_table(GRID, [(3, 1), (0, 0)], offset_mm=0.05))
+
+
+def test_places_are_those_of_the_polynomials(made: tuple[Run, Findings]) -> None:
+    poses = made[0][SMOOTH_TABLE].poses
+    shown = poses.status != Status.NOT_CONVERGED
+    for name, expected in zip(("lateral_mm", "anterior_mm", "internal_rotation_deg"), wandering(), strict=True):
+        np.testing.assert_allclose(getattr(poses, name)[shown], expected[shown], rtol=0, atol=1e-8)
+
+
+def test_every_entry_is_in_contact_to_a_micrometre(made: tuple[Run, Findings]) -> None:
+    table = made[0][SMOOTH_TABLE]
+    x, y, _ = wandering()
+    shown = table.poses.status != Status.NOT_CONVERGED
+    np.testing.assert_array_less(np.abs(table.contact_error_mm[shown]), 1.0001e-3)
+    expected = np.sqrt(REST_MM**2 - x**2 - y**2)
+    np.testing.assert_allclose(table.poses.proximal_mm[shown], expected[shown], rtol=0, atol=FACETS_MM)
+
+
+def test_midpoints_are_measured_where_both_ends_are_shown(made: tuple[Run, Findings]) -> None:
+    error = made[0][SMOOTH_TABLE].midpoint_error_mm
+    assert error.shape == (8, 3)
+    assert np.isnan(error[0, 0])
+    measured = np.delete(error.ravel(), 0)
+    # facets change from entry to entry: what a reader interpolates is off by no more
+    np.testing.assert_array_less(np.abs(measured), FACETS_MM)
+    assert np.ptp(measured) > 1e-5
+
+
+def test_a_failed_cell_between_usable_ones_is_shown_and_said(made: tuple[Run, Findings]) -> None:
+    run, findings = made
+    status = run[SMOOTH_TABLE].poses.status
+    assert status[3, 1] == Status.SMOOTHED
+    assert status[0, 0] == Status.NOT_CONVERGED
+    assert [(one.code, one.severity) for one in findings] == [("N-SMO-01", Severity.NOTE)]
+    assert findings[0].message.startswith("1 attitudes without a stable pose were smoothed over")
+
+
+def test_curves_and_ends_are_kept(made: tuple[Run, Findings]) -> None:
+    table = made[0][SMOOTH_TABLE]
+    assert [fit.name for fit in table.fits] == ["lateral_mm", "anterior_mm", "internal_rotation_deg"]
+    np.testing.assert_array_equal(table.flexion_range_deg, [0.0, 40.0])
+    np.testing.assert_array_equal(table.varus_range_deg, [-2.0, 2.0])
+    assert max(fit.residual_rms for fit in table.fits) < 1e-9
+
+
+def test_gaps_wider_than_the_setting_stay_open() -> None:
+    raw = raw_table(GRID, [(3, 1)])
+    table = smoothed(raw, PARAMS.model_copy(update={"fill_gap_deg": 9.0}))[0][SMOOTH_TABLE]
+    assert table.poses.status[3, 1] == Status.NOT_CONVERGED
+    assert np.isnan(table.contact_error_mm[3, 1])
+    np.testing.assert_array_equal(np.isnan(table.midpoint_error_mm[:, 1]), [False, False, True, True] + 4 * [False])
+
+
+def test_a_table_of_one_attitude_has_no_midpoints() -> None:
+    table = smoothed(raw_table(Grid(np.array([0.0]), np.array([0.0])), []))[0][SMOOTH_TABLE]
+    assert table.midpoint_error_mm.shape == (0, 1)
+    assert abs(table.contact_error_mm[0, 0]) <= 1e-3
+
+
+def test_too_few_usable_cells_are_refused() -> None:
+    raw = raw_table(GRID, [cell for cell in np.ndindex(GRID.shape) if cell[0] > 1])
+    with pytest.raises(CaseRejected, match="E-SMO-01 The curves cannot be smoothed: 6 usable cells cannot carry"):
+        smoothed(raw)
+
+
+def test_a_table_that_was_jumping_is_in_contact_all_the_same() -> None:
+    """One cell that the sweep found 1 mm beside its neighbours, deep in another dent."""
+    raw = raw_table(GRID, [])
+    x, z = raw.poses.lateral_mm.copy(), raw.poses.proximal_mm.copy()
+    x[4, 1] += 1.0
+    z[4, 1] += 0.4
+    table = smoothed(replace(raw, poses=replace(raw.poses, lateral_mm=x, proximal_mm=z)))[0][SMOOTH_TABLE]
+    assert table.poses.lateral_mm[4, 1] == pytest.approx(wandering()[0][4, 1], abs=1e-6)
+    np.testing.assert_array_less(np.abs(table.contact_error_mm), 1.0001e-3)
+    assert table.fits[0].residual_max == pytest.approx(1.0, abs=1e-6)
+
+
+def test_an_entry_that_has_to_be_pulled_back_has_a_negative_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def too_deep(bodies: Bodies, entry: Entry, motion: MotionSettings, proof: ProofSettings) -> Cell:
+        pose = settle(bodies, entry, motion, proof).pose
+        contact = AttitudeContact(bodies, np.radians(entry.flexion_deg), np.radians(entry.varus_deg))
+        return measured_cell(contact, pose._replace(z=pose.z + 3e-3), entry.status, proof)
+
+    monkeypatch.setattr("pipeline.stages.smooth.settle", too_deep)
+    table = smoothed(raw_table(Grid(np.array([0.0]), np.array([0.0])), []))[0][SMOOTH_TABLE]
+    assert table.contact_error_mm[0, 0] == -5e-3
