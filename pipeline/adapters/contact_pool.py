@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from pipeline.errors import EnvironmentFault
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.kinematics.contact import Bodies
 
@@ -63,6 +65,12 @@ def map_contact(
         try:
             _report(futures, done)
             return [future.result() for future in futures]
+        except BrokenProcessPool as error:
+            raise EnvironmentFault(
+                "E-ENV-30",
+                "A worker process ended before its work was done; most often the memory did not suffice.",
+                "Run again with fewer workers (--jobs 1), or on a computer with more memory.",
+            ) from error
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from pipeline.artifacts import ANATOMY, CASE_FACTS, MESHES
 from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage, StrictParams
@@ -36,6 +36,14 @@ class Params(StrictParams):
     delta: list[float] | None = Field(
         None, min_length=3, max_length=3, description="direction of the push in scan space (LPS), instead of a rule"
     )
+
+    @field_validator("delta")
+    @classmethod
+    def _delta_has_a_length(cls, delta: list[float] | None) -> list[float] | None:
+        if delta is not None and not any(delta):
+            raise ValueError("delta has no length")
+        return delta
+
     scan_from_reference: list[Row] | None = Field(
         None, description="4x4 frame of the reference body in scan space, with method given"
     )

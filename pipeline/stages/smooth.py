@@ -45,7 +45,7 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
         if _worst_midpoint(table) <= params.midpoint_limit_mm:
             break
         trial = _smoothed(raw, lower, params, pair, out)
-        if _worst_midpoint(trial) < _worst_midpoint(table):
+        if _shown(trial) >= _shown(table) and _worst_midpoint(trial) < _worst_midpoint(table):
             table, degree = trial, lower
     out[SMOOTH_TABLE] = table
     return _findings(table, wanted, degree)
@@ -71,6 +71,10 @@ def _smoothed(raw: RawTable, degree_varus: int, params: Params, pair: ContactPai
         contact_error_mm=np.array([[_contact_error(cell) for cell in row] for row in cells]),
         midpoint_error_mm=_midpoint_errors(raw.grid, poses, partial(way_to_contact, motion=params.motion()), pair, out),
     )
+
+
+def _shown(table: SmoothTable) -> int:
+    return int((table.poses.status <= Status.SMOOTHED).sum())
 
 
 def _worst_midpoint(table: SmoothTable) -> float:

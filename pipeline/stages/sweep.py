@@ -144,6 +144,7 @@ def _settings(params: Params) -> SweepSettings:
         slide_bound_mm=params.slide_bound_mm,
         rotation_bound_rad=float(np.radians(params.rotation_bound_deg)),
         max_motions=params.max_motions,
+        gain_mm=max(5e-4, 2.5 * params.contact_tolerance_mm),
         classic=params.classic,
         motion=params.motion(),
     )

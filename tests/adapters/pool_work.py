@@ -19,3 +19,8 @@ def refuse(bodies: Bodies, task: int) -> int:
     if task == 2:
         raise ValueError(f"task {task} cannot be done with {len(bodies.moving.points)} points")
     return task
+
+
+def die(_bodies: Bodies, _task: int) -> int:
+    """End the worker as a machine short of memory does."""
+    os._exit(9)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from pipeline.adapters.contact_pool import ContactPair, map_contact
+from pipeline.errors import EnvironmentFault
 from pipeline.geometry.mesh import TriangleMesh
-from tests.adapters.pool_work import depth_at, refuse
+from tests.adapters.pool_work import depth_at, die, refuse
 from tests.kinematics.hollow_joint import BALL_MM, FACETS_MM, REST_MM, hollow_pair
 
 TASKS = [1.0, -2.0, 0.0, 3.0, 0.5]
@@ -65,3 +66,8 @@ def test_bodies_that_cannot_be_built_are_refused_here() -> None:
     empty = TriangleMesh(np.empty((0, 3)), np.empty((0, 3), dtype=np.int32))
     with pytest.raises(ValueError, match="empty mesh"):
         map_contact(depth_at, [0.0], ContactPair(empty, hollow_pair().moving, 0.0), 1)
+
+
+def test_a_worker_that_dies_is_the_machines_fault() -> None:
+    with pytest.raises(EnvironmentFault, match="E-ENV-30 A worker process ended .* fewer workers"):
+        map_contact(die, [1, 2, 3], hollow_pair(), 2)

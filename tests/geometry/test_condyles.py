@@ -38,6 +38,13 @@ def test_rough_axes_off_by_20_degrees_give_the_same(femur: TriangleMesh, off: tu
     np.testing.assert_allclose(found.lateral.centre, LATERAL, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("off_deg", [20.0, -20.0])
+def test_on_condyles_that_are_no_spheres_the_patches_settle_on_the_axis(off_deg: float) -> None:
+    oblong = sphere_femur(MEDIAL, LATERAL, 1.15)
+    straight, turned = condyle_axis(oblong, SQUARE), condyle_axis(oblong, about(0.0, 0.0, off_deg))
+    assert angle_deg(straight.direction, turned.direction) < 0.01
+
+
 def test_a_mirrored_femur_has_the_mirrored_axis(femur: TriangleMesh) -> None:
     right = condyle_axis(femur, SQUARE)
     left = condyle_axis(transformed(femur, MIRROR), SQUARE * [-1.0, 1.0, 1.0])

@@ -21,7 +21,7 @@ from pipeline.records import CaseFacts, Side
 from pipeline.stages.mesh import STAGE, Params
 from tests.geometry.meshes import ball, octahedron
 
-SMALL = Params(triangles=1500, triangles_of={})
+SMALL = Params(required=["femur", "tibia"], triangles=1500, triangles_of={})
 DATA = Path(__file__).resolve().parents[2].parent / "shared/data/knee_mr_a/labels.nrrd"
 
 

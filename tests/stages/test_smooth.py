@@ -116,6 +116,18 @@ def test_a_table_of_one_attitude_has_no_midpoints() -> None:
     assert abs(table.contact_error_mm[0, 0]) <= 1e-3
 
 
+def test_a_lower_degree_in_varus_is_taken_only_where_it_serves_the_midpoints() -> None:
+    """x runs with varus here: lowering the degree moves entries, but their midpoints stay as good as the facets."""
+    kept, findings = smoothed(raw_table(GRID, []))
+    assert [fit.coefficients.shape for fit in kept[SMOOTH_TABLE].fits] == [(4, 3)] * 3
+    assert findings == ()
+    strict, said = smoothed(raw_table(GRID, []), PARAMS.model_copy(update={"midpoint_limit_mm": 1e-5}))
+    worst = [float(np.abs(run[SMOOTH_TABLE].midpoint_error_mm).max()) for run in (strict, kept)]
+    degree = strict[SMOOTH_TABLE].fits[0].coefficients.shape[1] - 1
+    assert worst[0] <= worst[1]
+    assert [one.code for one in said] == (["N-SMO-02"] if degree < 2 else [])
+
+
 def test_too_few_usable_cells_are_refused() -> None:
     raw = raw_table(GRID, [cell for cell in np.ndindex(GRID.shape) if cell[0] > 1])
     with pytest.raises(CaseRejected, match="E-SMO-01 The curves cannot be smoothed: 6 usable cells cannot carry"):

@@ -99,7 +99,7 @@ def test_a_joint_without_any_stable_pose_is_refused() -> None:
     """A ball that starts 200 mm beside the joint meets nothing."""
     beside = shifted(ball(), x=200.0)
     run = Run(STAGE, inputs(beside))
-    with pytest.raises(CaseRejected, match="E-SWP-01 No stable pose at any of 4 attitudes: 2 no_contact, 2 not_conver"):
+    with pytest.raises(CaseRejected, match="E-SWP-01 No stable pose at any of 4 attitudes: 2 no contact, 2 not conver"):
         run.go(Params(**SMALL))
     assert run.left == {}
 
@@ -116,7 +116,7 @@ def test_attitudes_that_failed_ask_for_review() -> None:
     np.testing.assert_array_equal(status[1], Status.SLID_OFF)
     np.testing.assert_array_equal(np.isnan(run[RAW_TABLE].poses.proximal_mm), status != Status.OK)
     assert [one.severity for one in findings] == [Severity.NOTE, Severity.REVIEW]
-    assert findings[1].message == "2 of 4 attitudes have no stable pose (2 ok, 2 slid_off)."
+    assert findings[1].message == "2 of 4 attitudes have no stable pose (2 ok, 2 slid off)."
 
 
 # --- settings
