@@ -61,8 +61,8 @@ def map_contact(
         return _in_this_process(work, tasks, pair, done)
     workers = min(jobs, len(tasks))
     with ProcessPoolExecutor(workers, get_context("spawn"), initializer=_build, initargs=(pair,)) as pool:
-        futures = [pool.submit(_run, work, task) for task in tasks]
         try:
+            futures = [pool.submit(_run, work, task) for task in tasks]
             _report(futures, done)
             return [future.result() for future in futures]
         except BrokenProcessPool as error:

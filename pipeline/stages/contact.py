@@ -25,7 +25,7 @@ class Params(StrictParams):
 
     reference: list[str] = Field(min_length=1, description="structures of the body that stands still")
     moving: list[str] = Field(min_length=1, description="structures of the body that moves, rigid on one another")
-    triangles: int = Field(40_000, ge=500, le=400_000, description="triangles of each body")
+    triangles: int = Field(60_000, ge=500, le=400_000, description="triangles of each body")
     reach_mm: float = Field(
         90.0, gt=10, le=1000, description="what lies farther than this from the joint never meets and is left out"
     )

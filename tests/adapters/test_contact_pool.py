@@ -69,5 +69,5 @@ def test_bodies_that_cannot_be_built_are_refused_here() -> None:
 
 
 def test_a_worker_that_dies_is_the_machines_fault() -> None:
-    with pytest.raises(EnvironmentFault, match="E-ENV-30 A worker process ended .* fewer workers"):
+    with pytest.raises(EnvironmentFault, match=r"E-ENV-30 A worker process ended .* fewer workers"):
         map_contact(die, [1, 2, 3], hollow_pair(), 2)

@@ -6,9 +6,10 @@ import sys
 from collections.abc import Sequence
 
 from tests.validate import Measurement, Row
+from tests.validate.knees import ROWS as KNEES
 from tests.validate.paper_objects import ROWS as PAPER_OBJECTS
 
-ROWS: tuple[Measurement, ...] = (*PAPER_OBJECTS,)
+ROWS: tuple[Measurement, ...] = (*PAPER_OBJECTS, *KNEES)
 
 
 def line(row: Row) -> str:

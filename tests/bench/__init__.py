@@ -1,0 +1,1 @@
+"""Speed, measured in one run: medians and ratios, because absolute times drift on a shared machine."""

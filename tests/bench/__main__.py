@@ -1,0 +1,143 @@
+"""Prints one table and writes build/bench.json: a phantom patient, contact queries, the solver, look-up."""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from pipeline.artifacts import ANATOMY, MOVING_BODY, REFERENCE_BODY
+from pipeline.config import load_settings
+from pipeline.contact_params import ContactParams
+from pipeline.engine.outcome import Execution, RunOutcome
+from pipeline.engine.runner import CaseJob, run_case
+from pipeline.files.phantom_case import write_phantom_case
+from pipeline.flow import FLOW
+from pipeline.geometry.phantom_spec import PhantomSpec
+from pipeline.kinematics.body_frames import scan_pose
+from pipeline.kinematics.contact import AttitudeContact
+from pipeline.kinematics.descent import drop
+from pipeline.kinematics.incremental import IncrementalSettings, solve_incremental
+from pipeline.playback import Lut
+from tests.end_to_end.knee_runs import Silent
+
+REPORT = Path("build/bench.json")
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One row: a name, what was measured, its unit, and what it is a multiple of."""
+
+    name: str
+    value: float
+    unit: str
+    ratio: str = ""
+
+
+def seconds(work: Callable[[], object], repeats: int) -> float:
+    """Median wall time of one call."""
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return median(times)
+
+
+def patient(folder: Path) -> tuple[RunOutcome, RunOutcome, float]:
+    """A demo patient from nothing and again from the cache; the seconds of the second."""
+    write_phantom_case(folder / "cases" / "bench", PhantomSpec())
+    settings = load_settings(FLOW, folder / "cases" / "bench", "demo")
+    job = CaseJob("bench", folder / "cases" / "bench", folder / "results" / "bench")
+
+    def process() -> RunOutcome:
+        return run_case(job, FLOW, settings, Execution(jobs=2), Silent())
+
+    first = process()
+    start = time.perf_counter()
+    again = process()
+    return first, again, time.perf_counter() - start
+
+
+def patient_figures(first: RunOutcome, cached_s: float) -> Iterator[Figure]:
+    """Each stage, the whole, and the cached run."""
+    total = sum(stage.seconds for stage in first.stages)
+    for stage in first.stages:
+        yield Figure(f"stage_{stage.stage}_s", stage.seconds, "s", f"{stage.seconds / total:.0%} of the patient")
+    yield Figure("patient_s", total, "s")
+    yield Figure("cached_rerun_s", cached_s, "s", f"{total / cached_s:.0f} times quicker than the first run")
+
+
+def contact_figures(results: Path) -> Iterator[Figure]:
+    """Queries of the exact collision test, a drop, and a cell of the incremental solver."""
+    anatomy = ANATOMY.decode({"": (results / "40_anatomy" / ANATOMY.file).read_bytes()})
+    reference = REFERENCE_BODY.decode({"": (results / "50_contact" / REFERENCE_BODY.file).read_bytes()})
+    moving = MOVING_BODY.decode({"": (results / "50_contact" / MOVING_BODY.file).read_bytes()})
+    params = ContactParams()
+    bodies = params.pair(reference, moving, anatomy).bodies()
+    contact = AttitudeContact(bodies, np.radians(anatomy.scan_attitude[0]), np.radians(anatomy.scan_attitude[1]))
+    rest = drop(contact, scan_pose(anatomy.scan_attitude), params.motion())
+    assert rest is not None
+    yes_no = seconds(lambda: contact.touches(rest), 50)
+    yield Figure("collide_ms", 1e3 * yes_no, "ms", "at contact, yes or no")
+    gap = seconds(lambda: contact.gap("medial", rest), 10)
+    yield Figure("distance_ms", 1e3 * gap, "ms", f"{gap / yes_no:.1f} yes/no tests")
+    features = seconds(lambda: contact.contacts(rest, params.contact_band_mm), 10)
+    yield Figure("contacts_ms", 1e3 * features, "ms", f"{features / yes_no:.1f} yes/no tests")
+    fall = seconds(lambda: drop(contact, rest._replace(z=rest.z - 1.0), params.motion()), 10)
+    yield Figure("drop_ms", 1e3 * fall, "ms", f"{fall / yes_no:.1f} yes/no tests")
+    starts = [rest.displaced(away) for away in ((0.5, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.02))]
+    solver = IncrementalSettings(motion=params.motion())
+    cell = median([seconds(lambda s=start: solve_incremental(contact, s, solver), 1) for start in starts])  # type: ignore[misc]
+    yield Figure("incremental_cells_per_s", 1.0 / cell, "1/s", f"a cell costs {cell / yes_no:.0f} yes/no tests")
+
+
+def lookup_figures(lut: Lut) -> Iterator[Figure]:
+    """One pose at a time, and many at once."""
+    angles = np.random.default_rng(0).uniform([0.0, -2.0], [120.0, 2.0], (20_000, 2))
+    pairs = [(float(f), float(v)) for f, v in angles[:2000]]
+    one = seconds(lambda: [lut.pose(f, v) for f, v in pairs], 5) / len(pairs)
+    many = seconds(lambda: lut.pose(angles[:, 0], angles[:, 1]), 5) / len(angles)
+    yield Figure("lookup_us", 1e6 * one, "us")
+    yield Figure("lookups_per_s", 1.0 / many, "1/s", f"{one / many:.0f} times one at a time")
+
+
+def peak_memory_mb() -> float:
+    """Of this process and its largest child."""
+    who = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    return max(resource.getrusage(one).ru_maxrss for one in who) / 1024.0
+
+
+def figures(folder: Path) -> Iterator[Figure]:
+    """Everything, in order."""
+    first, again, cached_s = patient(folder)
+    assert {stage.state for stage in again.stages} == {"cached"}
+    results = folder / "results" / "bench"
+    yield from patient_figures(first, cached_s)
+    yield from contact_figures(results)
+    yield from lookup_figures(Lut.open(results / "90_package" / "lut.h5"))
+    yield Figure("peak_rss_mb", peak_memory_mb(), "MB", "largest of the processes")
+
+
+def main() -> None:
+    """Measure and print each row as soon as it is known."""
+    measured = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for figure in figures(Path(folder)):
+            measured[figure.name] = figure.value
+            sys.stdout.write(f"{figure.name:<28}{figure.value:>12.4g} {figure.unit:<5}{figure.ratio}\n")
+            sys.stdout.flush()
+    REPORT.parent.mkdir(exist_ok=True)
+    REPORT.write_text(json.dumps(measured, indent=1, sort_keys=True) + "\n")
+
+
+if __name__ == "__main__":
+    main()
