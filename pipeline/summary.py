@@ -21,8 +21,9 @@ def header(case_id: str, protocol: str, settings: Mapping[str, StrictParams]) ->
         By stage name; side and joint are read from the settings of ``intake`` where there is such a stage.
     """
     facts = settings["intake"].model_dump() if "intake" in settings else {}
-    side = facts.get("side") or "side not declared"
-    return "   ".join((case_id, f"{side} {facts.get('joint', '')}".strip(), f"protocol {Path(protocol).stem}"))
+    side, joint = facts.get("side"), facts.get("joint", "")
+    what = f"{side} {joint}".strip() if side else f"{joint}, side not declared"
+    return "   ".join((case_id, what, f"protocol {Path(protocol).stem}"))
 
 
 def closing(outcome: RunOutcome, report: Path | None) -> list[str]:

@@ -8,7 +8,8 @@ plateau centres. Where landmarks of the hip or ankle were given, the mechanical 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -122,8 +123,10 @@ def knee_anatomy(
     upward = unit(volume_centroid(femur) - volume_centroid(tibia))
     femur_shaft, tibia_shaft = _shaft("femur", femur, upward), _shaft("tibia", tibia, -upward)
     rough = _rough_axes(structures, femur_shaft, handed)
-    condyles = condyle_axis(femur, rough)
-    plateau = plateau_centres(tibia, _rows(-tibia_shaft.direction, rough[0], handed))
+    with _named("the posterior condyles of the femur were not found"):
+        condyles = condyle_axis(femur, rough)
+    with _named("the tibial plateau was not found"):
+        plateau = plateau_centres(tibia, _rows(-tibia_shaft.direction, rough[0], handed))
     points = _points(condyles, plateau, femur_shaft, tibia_shaft, femur)
     points.update({name: Point(position, GIVEN_MM, given=True) for name, position in given.items()})
     axes = _chosen_axes(points, condyles, plateau, (femur_shaft, tibia_shaft))
@@ -143,11 +146,18 @@ def delta_of(rule: DeltaRule, axes: Mapping[str, Axis]) -> Float:
     return axis if rule == "long_axis" else orthogonal_part(axis, axes["flexion_axis"].direction)
 
 
-def _shaft(name: str, bone: TriangleMesh, away: Float) -> LongAxis:
+@contextmanager
+def _named(what: str) -> Iterator[None]:
+    """Say in the words of anatomy what a failed fit means."""
     try:
-        return long_axis(bone, away)
+        yield
     except ValueError as error:
-        raise ValueError(f"the long axis of the {name} was not found: {error}") from error
+        raise ValueError(f"{what} ({error})") from error
+
+
+def _shaft(name: str, bone: TriangleMesh, away: Float) -> LongAxis:
+    with _named(f"the long axis of the {name} was not found"):
+        return long_axis(bone, away)
 
 
 def _rough_axes(structures: Mapping[str, TriangleMesh], femur_shaft: LongAxis, handed: float) -> Float:
