@@ -2,7 +2,8 @@
 
 The posterior part of each condyle, which carries the knee from about 20 deg of flexion on, is close to a sphere
 (Kurosawa et al. 1985, J Biomech 18:487); its centre is found to a few tenths of a millimetre although the patch is
-small. The axis is fitted again with narrower and wider patches, and the spread is its uncertainty.
+small. The axis is fitted again with narrower, wider and shifted patches; their spread, and what the residual of the fit
+does to the centres, make its uncertainty.
 """
 
 from __future__ import annotations
@@ -34,7 +35,19 @@ class Patch:
 
 
 BEST_PATCH = Patch(20.0, 110.0, 8.0)
-OTHER_PATCHES = (Patch(30.0, 110.0, 8.0), Patch(20.0, 100.0, 8.0), Patch(20.0, 110.0, 6.0), Patch(20.0, 110.0, 10.0))
+OTHER_PATCHES = (
+    Patch(30.0, 110.0, 8.0),
+    Patch(20.0, 100.0, 8.0),
+    Patch(20.0, 110.0, 6.0),
+    Patch(20.0, 110.0, 10.0),
+    Patch(10.0, 100.0, 8.0),
+    Patch(30.0, 120.0, 8.0),
+)
+
+
+#: How far a fitted centre strays per RMS of the fit. Eight phantoms with 0.15 mm of smooth unevenness (8 to 25 mm
+#: wavelength) had their axis off by 0.6 deg in the median, 45 mm between the centres.
+CENTRE_PER_UNEVENNESS = 2.5
 
 
 class Sphere(NamedTuple):
@@ -80,7 +93,14 @@ def condyle_axis(femur: TriangleMesh, rough_axes: Float) -> CondyleAxis:
     direction = axes[0]
     others = [_spheres(femur, axes, patch) for patch in OTHER_PATCHES]
     spread = [angle_deg(direction, unit(there.centre - here.centre)) for here, there in others]
-    return CondyleAxis(medial, lateral, direction, float(np.sqrt(np.mean(np.square(spread)))))
+    uncertainty = np.hypot(np.sqrt(np.mean(np.square(spread))), _unevenness_deg(medial, lateral))
+    return CondyleAxis(medial, lateral, direction, float(uncertainty))
+
+
+def _unevenness_deg(medial: Sphere, lateral: Sphere) -> float:
+    """What the unevenness of the condyles does to the axis; other patches on the same bumps do not show it."""
+    apart = float(np.linalg.norm(lateral.centre - medial.centre))
+    return float(np.degrees(np.arctan2(CENTRE_PER_UNEVENNESS * np.hypot(medial.rms, lateral.rms), apart)))
 
 
 def _axes_on(lateral: Float, axes: Float) -> Float:

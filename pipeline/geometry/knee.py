@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.condyles import CondyleAxis, condyle_axis
 from pipeline.geometry.cross_sections import volume_centroid
-from pipeline.geometry.directions import orthogonal_part, smallest_turn, unit
+from pipeline.geometry.directions import angle_deg, orthogonal_part, smallest_turn, unit
 from pipeline.geometry.knee_side import SideSign, side_signs
 from pipeline.geometry.long_axis import LongAxis, long_axis
 from pipeline.geometry.mesh import TriangleMesh
@@ -30,6 +30,9 @@ DeltaRule = Literal["neutral", "long_axis"]
 
 #: One standard deviation of a landmark that a person placed, mm.
 GIVEN_MM = 1.0
+
+#: A mechanical axis is within 8 deg of the shaft; coordinates read the wrong way round are farther off than this.
+GIVEN_AXIS_DEG = 20.0
 
 #: Landmarks a user may give, by name.
 KNOWN_LANDMARKS = (
@@ -216,8 +219,8 @@ def _chosen_axes(
     else:
         how = "line through spheres fitted to the posterior condyles"
         flexion = Axis(condyles.direction, condyles.uncertainty_deg, how)
-    femoral = _to_given(points, knee, ("femoral_head_centre", "femur_shaft_centre"))
-    tibial = _to_given(points, plateau, ("ankle_centre", "tibia_shaft_centre"))
+    femoral = _to_given(points, knee, ("femoral_head_centre", "femur_shaft_centre"), femur_shaft.direction)
+    tibial = _to_given(points, plateau, ("ankle_centre", "tibia_shaft_centre"), tibia_shaft.direction)
     return {
         "flexion_axis": flexion,
         "femoral_long_axis": femoral or _of_shaft(femur_shaft, 1.0),
@@ -234,10 +237,16 @@ def _mediolateral(points: Mapping[str, Point], found: Plateau) -> Axis:
     return Axis(direction, found.uncertainty_deg, "line through the centres of the plateau's articular surfaces")
 
 
-def _to_given(points: Mapping[str, Point], joint: Float, names: tuple[str, ...]) -> Axis | None:
+def _to_given(points: Mapping[str, Point], joint: Float, names: tuple[str, ...], shaft: Float) -> Axis | None:
+    """Axis to the first of the named landmarks that was given; it has to run roughly along the shaft."""
     for name in names:
         if name in points and points[name].given:
-            return _axis_between(joint, points[name].position, f"from the joint to the given {name.replace('_', ' ')}")
+            words = name.replace("_", " ")
+            axis = _axis_between(joint, points[name].position, f"from the joint to the given {words}")
+            away = angle_deg(axis.direction, shaft)
+            if away > GIVEN_AXIS_DEG:
+                raise ValueError(f"the given {words} lies {away:.0f} deg off the shaft; is its file LPS or RAS?")
+            return axis
     return None
 
 

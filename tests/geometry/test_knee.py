@@ -13,7 +13,8 @@ from pipeline.files.volumes import read_label_map
 from pipeline.geometry.directions import angle_deg, orthogonal_part, unit
 from pipeline.geometry.knee import GIVEN_MM, KneeAnatomy, knee_anatomy
 from pipeline.geometry.mesh import Float, TriangleMesh
-from pipeline.geometry.phantom import PHANTOM_LABELS, PhantomTruth
+from pipeline.geometry.phantom import PHANTOM_LABELS, PhantomTruth, phantom_labels, phantom_truth
+from pipeline.geometry.phantom_spec import PhantomSpec
 from pipeline.kinematics.joint_coordinates import reference_from_moving, rigid
 from tests.geometry.knees import MESHED, MIRROR, about, moved, phantom_knee, sphere
 
@@ -153,7 +154,7 @@ def test_bones_alone_give_frames_but_no_sign(knee: Knee, found: KneeAnatomy) -> 
 
 
 def test_a_bone_without_shaft_is_named(knee: Knee) -> None:
-    with pytest.raises(ValueError, match=r"the long axis of the tibia was not found \(fewer than three"):
+    with pytest.raises(ValueError, match=r"the long axis of the tibia was not found \(fewer than 6"):
         knee_anatomy({**knee, "tibia": sphere(8.0, (30.0, -20.0, 60.0), fine=2)}, 1.0, {})
 
 
@@ -202,6 +203,27 @@ def test_given_plateau_centres_are_the_tibial_frame(knee: Knee, truth: PhantomTr
     axis = found.axes["tibial_mediolateral_axis"]
     np.testing.assert_allclose(axis.direction, unit(given[names[1]] - given[names[0]]), rtol=0, atol=1e-12)
     assert axis.method == "line through the given plateau centres"
+
+
+def test_a_hip_read_the_wrong_way_round_is_refused(knee: Knee, found: KneeAnatomy) -> None:
+    """The hip of a knee 80 mm beside the middle of the scanner, with left and right, front and back exchanged."""
+    beside = np.eye(4)
+    beside[:3, 3] = [-80.0, 30.0, 0.0]
+    hip = (found.scan_from_femur @ [0.0, 0.0, 420.0, 1.0])[:3] + beside[:3, 3]
+    with pytest.raises(ValueError, match=r"femoral head centre lies .* deg off the shaft; is its file LPS or RAS"):
+        knee_anatomy(moved(knee, beside), 1.0, {"femoral_head_centre": hip * [-1.0, -1.0, 1.0]})
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_flexion_axis_of_an_uneven_femur_is_as_uncertain_as_it_is_wrong(seed: int) -> None:
+    spec = PhantomSpec(spacing_mm=(1.4, 1.4, 1.4), shaft_length_mm=45.0, roughness_mm=0.15, seed=seed)
+    volume, true = phantom_labels(spec), phantom_truth(spec)
+    settings = SurfaceSettings(triangles=4000)
+    bones = ("femur", "tibia", "patella")
+    meshes = {b: mask_to_mesh(volume.values == PHANTOM_LABELS[b], volume.lps_from_index, settings).mesh for b in bones}
+    axis = knee_anatomy(meshes, 1.0, {}).axes["flexion_axis"]
+    assert angle_deg(axis.direction, true.flexion_axis) < 2.5 * axis.uncertainty_deg
+    assert axis.uncertainty_deg < 3.0
 
 
 # --- a real knee

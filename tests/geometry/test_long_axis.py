@@ -49,10 +49,19 @@ def test_the_uncertainty_is_the_stray_over_the_length() -> None:
 
 
 def test_a_bone_without_shaft_is_refused() -> None:
-    with pytest.raises(ValueError, match="fewer than three cross-sections of the shaft"):
-        long_axis(box((-30.0, 30.0), (-20.0, 20.0), (0.0, 40.0)), Z)
+    with pytest.raises(ValueError, match="fewer than 6 cross-sections beyond the joint"):
+        long_axis(box((-30.0, 30.0), (-20.0, 20.0), (0.0, 12.0)), Z)
     with pytest.raises(ValueError, match="too short for cross-sections"):
         long_axis(box((-30.0, 30.0), (-20.0, 20.0), (0.0, 5.0)), Z)
+
+
+def test_without_a_shaft_the_last_of_the_flare_must_do_and_says_so() -> None:
+    """A cone that never falls below 0.6 of its widest area: the last six sections, uncertain by 14 deg."""
+    stump = revolved(np.array([[0, 0], [30, 0], [30, 4], [25, 44], [0, 44]], dtype=float), 48)
+    found = long_axis(stump, Z)
+    assert angle_deg(found.direction, Z) < 0.1
+    assert found.length_mm == pytest.approx(10.0)
+    assert found.uncertainty_deg == pytest.approx(0.5 + np.degrees(np.arctan(STRAY_MM / 10.0)))
 
 
 def test_a_gap_in_the_bone_is_stepped_over() -> None:

@@ -122,7 +122,7 @@ def test_landmarks_of_the_other_coordinate_system_are_recognised() -> None:
 
 def test_a_scan_that_shows_too_little_is_refused() -> None:
     stump: dict[str, TriangleMesh] = {**phantom_knee()[0], "tibia": sphere(8.0, (30.0, -20.0, 60.0), fine=2)}
-    with pytest.raises(CaseRejected, match=r"E-ANA-01 The long axis of the tibia was not found \(fewer than three"):
+    with pytest.raises(CaseRejected, match=r"E-ANA-01 The long axis of the tibia was not found \(fewer than 6"):
         found(stump)
 
 
