@@ -35,7 +35,9 @@ def stage_lines(outcome: StageOutcome, index: int, total: int) -> tuple[str, ...
     Such as ``[1/8] intake     ok        0.3 s  ran (no result yet)``.
     """
     to_look_at = [finding for finding in outcome.findings if finding.severity is Severity.REVIEW]
-    word = "failed" if outcome.state == "failed" else "review" if to_look_at else "ok"
+    word = "review" if to_look_at else "ok"
+    if outcome.state == "failed":
+        word = "halted" if outcome.reason == "interrupted" else "failed"
     why = f"ran ({outcome.reason})" if outcome.state == "ran" else outcome.reason
     head = f"[{index}/{total}] {outcome.stage:<10} {word:<6} {outcome.seconds:7.1f} s  {printable(why)}"
     return (head, *(f"      {finding.code} {printable(finding.message)}" for finding in to_look_at))

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -28,6 +29,8 @@ def test_one_line_a_stage(*, terminal: bool) -> None:
     assert shown(RAN, terminal=terminal) == "[1/8] intake     ok         0.3 s  ran (no result yet)\n"
     assert shown(CACHED, terminal=terminal) == "[1/8] mesh       ok         0.0 s  up to date\n"
     assert shown(FAILED, terminal=terminal) == "[1/8] sweep      failed    61.0 s  E-ENV-01\n"
+    interrupted = replace(FAILED, reason="interrupted")
+    assert shown(interrupted, terminal=terminal) == "[1/8] sweep      halted    61.0 s  interrupted\n"
 
 
 def test_a_finding_to_review_is_shown_and_cannot_steer_the_terminal() -> None:

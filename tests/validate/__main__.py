@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from tests.validate import Measurement, Row
 from tests.validate.knees import ROWS as KNEES
+from tests.validate.measured_motion import ROWS as MOTION
 from tests.validate.paper_objects import ROWS as PAPER_OBJECTS
 
-ROWS: tuple[Measurement, ...] = (*PAPER_OBJECTS, *KNEES)
+REPORT = Path("build/validate.json")
+ROWS: tuple[Measurement, ...] = (*PAPER_OBJECTS, *KNEES, *MOTION)
 
 
 def line(row: Row) -> str:
@@ -21,12 +25,15 @@ def line(row: Row) -> str:
 
 def main(measurements: Sequence[Measurement]) -> int:
     """Measure, print each row as soon as it is known, and say whether every target was met."""
-    met = True
+    met, measured = True, {}
     for measure in measurements:
         row = measure()
+        measured[row.name] = row.value
         sys.stdout.write(line(row) + "\n")
         sys.stdout.flush()
         met = met and row.met
+    REPORT.parent.mkdir(exist_ok=True)
+    REPORT.write_text(json.dumps(measured, indent=1, sort_keys=True) + "\n")
     return 0 if met else 1
 
 
