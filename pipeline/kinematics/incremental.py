@@ -35,6 +35,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Literal
 
 import numpy as np
@@ -242,7 +243,7 @@ def _classic_round(search: _Search) -> Status | Literal["equilibrium"] | None:
 
 def _confirm(search: _Search) -> Literal["equilibrium"] | None:
     """Equilibrium when no trial near by goes deeper; else stand at the deeper pose and go on."""
-    for trial in (*_joint_trials(search), *_unit_trials(search)):
+    for trial in chain(_joint_trials(search), _unit_trials(search)):
         search.motions += 1
         landed = drop(search.contact, trial, search.settings.motion)
         if landed is not None and _deeper(search, landed):
