@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from pipeline.engine.artifacts import SOURCE
-from pipeline.engine.stage import Stage, StrictParams, findings_of
+from pipeline.engine.stage import Stage, StrictParams, findings_of, settings_of
 from pipeline.flow import FLOW
 from tests.source_code import CHECKOUT, Module, arguments_of, functions, imports, lines_of, modules
 
@@ -160,7 +160,7 @@ def test_artifacts_have_one_writer_and_are_read_after_it() -> None:
     written = {SOURCE.name}
     for stage in FLOW:
         assert {artifact.name for artifact in stage.reads} <= written, stage.name
-        new = [*(artifact.name for artifact in stage.writes), findings_of(stage.name).name]
+        new = [artifact.name for artifact in (*stage.writes, findings_of(stage.name), settings_of(stage.name))]
         assert not written & set(new), stage.name
         written |= set(new)
 

@@ -52,10 +52,10 @@ def flow_table() -> str:
     rows = [*_table("stage", "does", "reads", "leaves")]
     for stage in FLOW:
         does = _plain((sys.modules[stage.run.__module__].__doc__ or "").split("\n\n")[0]).split(": ", 1)[1]
-        reads = [a.name for a in stage.reads if not a.name.endswith("_findings")]
-        findings = [a.name.removesuffix("_findings") for a in stage.reads if a.name.endswith("_findings")]
-        if findings:
-            reads.append(f"findings of {', '.join(findings)}")
+        reads = [a.name for a in stage.reads if not a.name.endswith(("_findings", "_settings"))]
+        for kind in ("findings", "settings"):
+            of = [a.name.removesuffix(f"_{kind}") for a in stage.reads if a.name.endswith(f"_{kind}")]
+            reads += [f"{kind} of {', '.join(of)}"] if of else []
         leaves = ", ".join(f"`{a.file}`" for a in stage.writes)
         rows.append(_row(f"`{stage.folder}`", does, ", ".join(reads), leaves))
     return "\n".join(rows)

@@ -40,7 +40,7 @@ from pipeline.engine.source import list_source
 from pipeline.engine.stage import Findings, Severity, Stage, StrictParams
 from pipeline.engine.storage_faults import environment_fault, is_environmental, memory_fault
 from pipeline.engine.store import commit_folder, fingerprint, set_aside, sweep
-from pipeline.engine.wiring import MANIFEST_FILE, check_flow, findings_artifact, stage_files
+from pipeline.engine.wiring import MANIFEST_FILE, check_flow, findings_artifact, settings_artifact, stage_files
 from pipeline.errors import CaseRejected, ConfigError, ExitCode, PipelineError
 
 _BUG = "E-BUG-01"
@@ -196,9 +196,11 @@ def _computed(run: _Run, stage: Stage, shelf: Shelf, found: Lookup) -> Manifest:
         set_aside(folder)
     run.announce(stage, found.reason)
     out = StageOutputs(stage, run.execution.jobs, partial(run.listener.stage_progress, stage.name))
-    findings = stage.run(StageInputs(stage, shelf), run.settings[stage.name], out)
-    listed = findings_artifact(stage.name)
-    files = stage_files(stage, {**out.complete(), listed.name: listed.encode(findings)})
+    settings = run.settings[stage.name]
+    findings = stage.run(StageInputs(stage, shelf), settings, out)
+    listed, used = findings_artifact(stage.name), settings_artifact(stage.name)
+    own = {listed.name: listed.encode(findings), used.name: used.encode(settings.model_dump(mode="json"))}
+    files = stage_files(stage, {**out.complete(), **own})
     recipe, outputs = found.recipe, _output_records(files)
     manifest = Manifest(recipe.key, recipe, outputs, findings, run.seconds, found.sources)
     data = {name: content for name, (_, content) in files.items()}

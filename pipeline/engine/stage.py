@@ -45,6 +45,11 @@ def findings_of(stage: str) -> Artifact[Findings]:
     return record_artifact(f"{stage}_findings", "findings.json", tuple[Finding, ...])
 
 
+def settings_of(stage: str) -> Artifact[dict[str, Any]]:
+    """The settings that a stage ran with, which the runner writes beside its artifacts; a later stage may read them."""
+    return record_artifact(f"{stage}_settings", "settings.json", dict[str, Any])
+
+
 class Inputs(Protocol):
     """What a stage is given: ``reads[ARTIFACT]`` decodes that artifact, typed."""
 

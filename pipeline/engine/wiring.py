@@ -9,7 +9,7 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from pipeline.engine.artifacts import SOURCE, Artifact, Files
-from pipeline.engine.stage import Findings, Stage, findings_of
+from pipeline.engine.stage import Findings, Stage, findings_of, settings_of
 
 MANIFEST_FILE = "stage.json"
 
@@ -20,9 +20,15 @@ def findings_artifact(stage: str) -> Artifact[Findings]:
     return findings_of(stage)
 
 
+@cache
+def settings_artifact(stage: str) -> Artifact[dict[str, Any]]:
+    """The settings of a stage; made once, like the findings."""
+    return settings_of(stage)
+
+
 def written_by(stage: Stage) -> tuple[Artifact[Any], ...]:
-    """All that a stage leaves: its artifacts and its findings."""
-    return (*stage.writes, findings_artifact(stage.name))
+    """All that a stage leaves: its artifacts, its findings and its settings."""
+    return (*stage.writes, findings_artifact(stage.name), settings_artifact(stage.name))
 
 
 def check_flow(flow: Sequence[Stage]) -> None:

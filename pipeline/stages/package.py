@@ -24,7 +24,7 @@ from pipeline.artifacts import (
     VERDICT,
 )
 from pipeline.engine.records import canonical_json
-from pipeline.engine.stage import Findings, Inputs, Outputs, Stage, StrictParams, findings_of
+from pipeline.engine.stage import Findings, Inputs, Outputs, Stage, StrictParams, findings_of, settings_of
 from pipeline.files.archive import encode_zip
 from pipeline.files.csv_table import encode_csv
 from pipeline.files.lut_content import LutFileContent
@@ -34,7 +34,9 @@ from pipeline.geometry.mesh import TriangleMesh
 from pipeline.records import CaseFacts, SurfaceOrigin
 
 #: Findings of every stage before this one, in order; one object each, since artifacts are told apart by identity.
-_FINDINGS = {name: findings_of(name) for name in ("intake", "mesh", "anatomy", "contact", "sweep", "smooth", "qa")}
+_STAGES = ("intake", "mesh", "anatomy", "contact", "sweep", "smooth", "qa")
+_SETTINGS = {name: settings_of(name) for name in _STAGES}
+_FINDINGS = {name: findings_of(name) for name in _STAGES}
 
 #: Packages whose numbers or files are in the deliverable.
 _PACKAGES = ("h5py", "meshio", "numpy", "pyvista", "python-fcl", "scipy", "trimesh", "vtk")
@@ -147,6 +149,7 @@ def _manifest(reads: Inputs, files: Mapping[str, bytes]) -> dict[str, Any]:
         ],
         # not their names, since a user may have put a patient's name into one
         "sources_sha256": sorted(facts.source_files.values()),
+        "settings": {name: reads[artifact] for name, artifact in _SETTINGS.items()},
         "findings": [
             {"stage": stage, "code": one.code, "severity": str(one.severity), "message": one.message}
             for stage, artifact in _FINDINGS.items()
@@ -173,6 +176,7 @@ STAGE = Stage(
         VERDICT,
         REPORT,
         *_FINDINGS.values(),
+        *_SETTINGS.values(),
     ),
     writes=(PACKAGE,),
     Params=Params,

@@ -76,7 +76,7 @@ def test_the_results_lie_where_the_design_says(job: CaseJob) -> None:
         *(
             f"{folder}/{name}"
             for folder in ("10_gather", "20_multiply", "30_total")
-            for name in ("stage.json", "findings.json")
+            for name in ("stage.json", "findings.json", "settings.json")
         ),
         "10_gather/numbers.json",
         "20_multiply/multiples.json",

@@ -71,7 +71,8 @@ class Out:
 
 def reads(side: Side = "right") -> Reads:
     table = content(side)
-    values = {artifact.name: () for artifact in STAGE.reads if artifact.name.endswith("_findings")}
+    values: dict[str, object] = {a.name: () for a in STAGE.reads if a.name.endswith("_findings")}
+    values |= {a.name: {} for a in STAGE.reads if a.name.endswith("_settings")}
     origins = (
         SurfaceOrigin("reference", "femur", "labelled"),
         SurfaceOrigin("reference", "femoral_cartilage", "synthesised"),
@@ -82,6 +83,7 @@ def reads(side: Side = "right") -> Reads:
         {
             **values,
             "intake_findings": (FINDING,),
+            "sweep_settings": {"flexion_step_deg": 5.0},
             CASE_FACTS.name: _facts(side),
             MESHES.name: {"femur": table.reference_body, "tibia": table.moving_body},
             ANATOMY.name: _anatomy(table, side),
@@ -159,6 +161,8 @@ def test_the_manifest_names_every_file_by_its_hash(files: dict[str, bytes]) -> N
     for name, entry in manifest["files"].items():
         assert entry == {"sha256": hashlib.sha256(files[name]).hexdigest(), "bytes": len(files[name])}
     assert manifest["verdict"] == {"word": "REVIEW", "reasons": ["Only 63 mm of tibia in the scan."]}
+    assert manifest["settings"]["sweep"] == {"flexion_step_deg": 5.0}
+    assert set(manifest["settings"]) == {"intake", "mesh", "anatomy", "contact", "sweep", "smooth", "qa"}
     assert manifest["findings"] == [
         {"stage": "intake", "code": "W-FOV-01", "severity": "review", "message": "Only 63 mm of tibia in the scan."}
     ]
