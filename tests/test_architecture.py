@@ -183,7 +183,8 @@ def test_settings_are_strict_ranged_and_described(stage: Stage) -> None:
             assert UNITS.search(name), f"{stage.name}.{name} has no unit in its name"
 
 
-FORBIDDEN = re.compile(r"/work/|/home/|/root/|farm-studio|\bTODO\b|\bFIXME\b|\bXXX\b", re.IGNORECASE)  # the words
+#: Paths of a machine, this checkout's own among them, and loose ends.
+FORBIDDEN = re.compile(rf"/home/|/root/|{re.escape(str(CHECKOUT))}/|\bTODO\b|\bFIXME\b|\bXXX\b", re.IGNORECASE)
 
 
 def test_no_path_of_a_machine_and_no_loose_ends() -> None:
