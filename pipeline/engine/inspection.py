@@ -106,7 +106,11 @@ def verify_case(results: Path, flow: Sequence[Stage]) -> tuple[str, ...]:
                 problems += [f"{stage.folder}: {manifest.reason}"] if folder.exists() else []
                 continue
             problems += [f"{stage.folder}: {one}" for one in _problems(folder, manifest, known)]
-            known |= {one.name: InputRecord(manifest.content_hash(one), one.schema) for one in written_by(stage)}
+            held = [one for one in written_by(stage) if one.is_folder or manifest.files_of(one)]
+            absent = [one.name.replace("_", " ") for one in written_by(stage) if one not in held]
+            if absent:
+                problems.append(f"{stage.folder}: made by another version of the program (no {', '.join(absent)})")
+            known |= {one.name: InputRecord(manifest.content_hash(one), one.schema) for one in held}
     return tuple(problems)
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from pipeline.engine.inspection import PlanRow, plan_case, read_status, verify_case
 from pipeline.engine.lock import case_lock
 from pipeline.engine.outcome import CaseJob, RunRecord, save_record
+from pipeline.engine.records import record_artifact
 from pipeline.errors import CaseRejected
 from tests.engine.toy_flow import DEFAULTS, FLOW, GatherParams, MultiplyParams, SumParams, make_case, run
 
@@ -53,6 +55,14 @@ def test_verify_finds_stages_that_do_not_belong_together(job: CaseJob) -> None:
     assert verify_case(job.results, FLOW) == ()
     run(job, FLOW[:1], {"gather": GatherParams(keep=1)})
     assert verify_case(job.results, FLOW) == ("20_multiply: made from another numbers than the one that is there now",)
+
+
+def test_verify_says_when_another_version_made_a_result(job: CaseJob) -> None:
+    """A later version of the program leaves one more file."""
+    run(job)
+    later = replace(FLOW[0], writes=(*FLOW[0].writes, record_artifact("more", "more.json", int)))
+    problem = "10_gather: made by another version of the program (no more)"
+    assert verify_case(job.results, (later, *FLOW[1:])) == (problem,)
 
 
 def test_verify_names_a_damaged_record(job: CaseJob) -> None:
