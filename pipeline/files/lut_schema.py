@@ -82,8 +82,8 @@ _LAYOUT = """
 /raw/iterations              i4 flexion_deg,varus_deg 1   iterations: motions the solver made
 /raw/gap_before_mm           f8 flexion_deg,varus_deg mm  gap before contact: pulled back by this, the bodies are clear
 /raw/gap_after_mm            f8 flexion_deg,varus_deg mm  gap after contact: pushed on by this, the bodies intersect
-/raw/hysteresis_mm           f8 flexion_deg,varus_deg mm  hysteresis of position: up-sweep against down-sweep
-/raw/hysteresis_deg          f8 flexion_deg,varus_deg deg hysteresis of rotation: up-sweep against down-sweep
+/raw/hysteresis_mm           f8 flexion_deg,varus_deg mm  hysteresis of position: way out against way back
+/raw/hysteresis_deg          f8 flexion_deg,varus_deg deg hysteresis of rotation: way out against way back
 /smoothing/coefficients      f8 curve,flexion_order,varus_order 1   coefficients: in the curve's unit
 /smoothing/degrees           i4 curve,driven          1   degrees: of each curve in flexion and in varus
 /smoothing/residual_rms      f8 curve                 1   RMS residual: of raw minus fitted, in the curve's unit

@@ -42,7 +42,9 @@ def contains(mesh: TriangleMesh, points: Float) -> NDArray[np.bool_]:
     return np.asarray(winding_number(points, mesh) > 0.5)
 
 
-def nested(first: TriangleMesh, second: TriangleMesh) -> bool:
+def nested(
+    first: TriangleMesh, second: TriangleMesh, rotation: Float | None = None, shift: Float | None = None
+) -> bool:
     """Whether one of two bodies holds a piece of the other, given that their surfaces do not cross.
 
     One vertex of each connected piece decides: without crossings a piece is inside as a whole or not at all.
@@ -50,9 +52,13 @@ def nested(first: TriangleMesh, second: TriangleMesh) -> bool:
     Parameters
     ----------
     first, second : TriangleMesh
-        Closed, in one frame.
+        Closed.
+    rotation, shift : (3, 3) and (3,) float64, optional
+        Placement of the second in the first's frame, mm; as it is when not given.
     """
-    return bool(contains(second, piece_points(first)).any() or contains(first, piece_points(second)).any())
+    turn, way = np.eye(3) if rotation is None else rotation, np.zeros(3) if shift is None else shift
+    placed, taken_back = piece_points(second) @ turn.T + way, (piece_points(first) - way) @ turn
+    return bool(contains(first, placed).any() or contains(second, taken_back).any())
 
 
 def _solid_angles(points: Float, corners: Float) -> Float:

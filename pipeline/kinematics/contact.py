@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.containment import contains, piece_points
+from pipeline.geometry.containment import nested
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.geometry.triangles import near_features, with_neighbours
 from pipeline.kinematics.joint_coordinates import Float, attitude_rotation, rotation_z
@@ -104,10 +104,7 @@ class AttitudeContact:
 
     def nested(self, pose: Pose) -> bool:
         """Whether one body lies inside the other at ``pose``, where surfaces may not cross at all."""
-        rotation, shift = self._placement(pose)
-        reference, moving = self.bodies.reference, self.bodies.moving
-        placed, taken_back = piece_points(moving) @ rotation.T + shift, (piece_points(reference) - shift) @ rotation
-        return bool(contains(reference, placed).any() or contains(moving, taken_back).any())
+        return nested(self.bodies.reference, self.bodies.moving, *self._placement(pose))
 
     def contacts(self, pose: Pose, band_mm: float, *, along_only: bool = False) -> Contacts:
         """Feature pairs within ``band_mm`` at a pose where the bodies are clear of one another.

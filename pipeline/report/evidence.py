@@ -12,7 +12,7 @@ from pipeline.engine.stage import Findings
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.geometry.volume import LabelVolume
 from pipeline.kinematics.joint_coordinates import JointCoordinates, moved_from_scan
-from pipeline.kinematics.table import Grid, PoseTable, RawTable, SmoothTable, Status
+from pipeline.kinematics.table import Grid, RawTable, SmoothTable, Status
 from pipeline.records import Anatomy, CaseFacts, MeshQuality, ScanReturn, SurfaceOrigin
 
 Float = NDArray[np.float64]
@@ -73,11 +73,6 @@ class Cell:
     flexion_deg: float
     varus_deg: float
     status: Status
-
-
-def usable(poses: PoseTable) -> NDArray[np.bool_]:
-    """(F, V) whether each entry may be shown."""
-    return np.asarray(poses.status <= Status.SMOOTHED)
 
 
 def shown_flexions(grid: Grid, wanted_deg: list[float]) -> tuple[int, ...]:

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.adapters.plotting import Chart, Curve, charts_png
+from pipeline.kinematics.interpolation import usable_entries
 from pipeline.kinematics.table import Status
-from pipeline.report.evidence import CURVES, STATUS_WORDS, Evidence, neutral_varus, usable
+from pipeline.report.evidence import CURVES, STATUS_WORDS, Evidence, neutral_varus
 from pipeline.report.figure_frame import RESEARCH_USE, heading
 from pipeline.report.palette import hexadecimal, scale
 from pipeline.report.settings import Limits
@@ -94,7 +95,7 @@ def checks_png(evidence: Evidence, limits: Limits) -> bytes:
     ValueError
         When no entry of the table is usable.
     """
-    if not usable(evidence.smooth.poses).any():
+    if not usable_entries(evidence.smooth.poses).any():
         raise ValueError("no entry of the table is usable")
     raw, smooth = evidence.raw, evidence.smooth
     middles = (smooth.grid.flexion_deg[1:] + smooth.grid.flexion_deg[:-1]) / 2.0
@@ -104,7 +105,7 @@ def checks_png(evidence: Evidence, limits: Limits) -> bytes:
     charts = [
         Chart("Contact error between entries: + gap, - overlap", FLEXION, "mm", between),
         Chart(
-            "Hysteresis: bending against straightening",
+            "Hysteresis: way out against way back",
             FLEXION,
             "mm",
             _lines(evidence, raw.grid.flexion_deg, raw.hysteresis_mm),

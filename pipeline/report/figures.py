@@ -102,7 +102,7 @@ CHECKS = Figure(
     "checks",
     "Contact and repeatability against flexion",
     Caption(
-        "What is left of gap or overlap after smoothing, the gap of each side, and bending against straightening.",
+        "What is left of gap or overlap after smoothing, the gap of each side, and way out against way back.",
         "Contact error within the dashed lines; at neutral varus both gaps are small; hysteresis near zero.",
         "Contact error beyond the dashed lines, one side wide open at every varus, hysteresis above 1 mm.",
         "Use a finer grid or a higher degree of smoothing where contact is lost; check the axes where a side is open.",

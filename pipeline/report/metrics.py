@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.mesh import TriangleMesh, edge_defects
+from pipeline.kinematics.interpolation import usable_entries
 from pipeline.kinematics.table import PoseTable, SmoothTable, Status
 from pipeline.records import Metric
-from pipeline.report.evidence import CURVES, STATUS_WORDS, Evidence, plain, usable
+from pipeline.report.evidence import CURVES, STATUS_WORDS, Evidence, plain
 from pipeline.report.settings import Limits
 
 Float = NDArray[np.float64]
@@ -101,9 +102,9 @@ def _anatomy_metrics(evidence: Evidence) -> Iterator[Metric]:
 
 def _sweep_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
     raw = evidence.raw
-    found = usable(raw.poses)
-    shown = usable(evidence.smooth.poses)
-    meaning = "Attitudes of the table that have a stable pose; the others are marked and never shown."
+    found = usable_entries(raw.poses)
+    shown = usable_entries(evidence.smooth.poses)
+    meaning = "Attitudes that may be shown: stable, or marked as smoothed over between stable ones; the others are never shown."
     cells = Measured("usable_cells", "Usable entries of the table", float(shown.sum()), "entries", meaning)
     yield at_least(cells, shown.size)
     for status in Status:
@@ -124,7 +125,7 @@ def _sweep_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
 
 def _repeatability_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
     raw = evidence.raw
-    meaning = "Difference of bending and straightening, largest; below 1 mm and 2 deg in the literature."
+    meaning = "Difference of the way out and the way back, largest (bending at neutral varus, opening elsewhere); below 1 mm and 2 deg in the literature."
     for values, unit in ((raw.hysteresis_mm, "mm"), (raw.hysteresis_deg, "deg")):
         if np.isfinite(values).any():
             title = f"Hysteresis ({'shift' if unit == 'mm' else 'rotation'})"
@@ -152,7 +153,7 @@ def jumps(raw: PoseTable, fitted: PoseTable) -> tuple[Float, Float]:
     Taking the fit off first leaves out the motion itself, so the measure does not depend on the step of the grid. NaN
     beside an unusable entry.
     """
-    both = usable(raw) & usable(fitted)
+    both = usable_entries(raw) & usable_entries(fitted)
     names = [name for name, _, _ in CURVES]
     rest = np.stack([np.where(both, getattr(raw, name) - getattr(fitted, name), np.nan) for name in names], axis=-1)
     steps = np.concatenate([np.diff(rest, axis=0).reshape(-1, 4), np.diff(rest, axis=1).reshape(-1, 4)])
@@ -196,7 +197,7 @@ def _smooth_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
 
 def untested(smooth: SmoothTable) -> int:
     """Number of usable entries, and of middles between usable entries along flexion, without a contact error."""
-    shown = usable(smooth.poses)
+    shown = usable_entries(smooth.poses)
     entries = shown & ~np.isfinite(smooth.contact_error_mm)
     middles = shown[1:] & shown[:-1] & ~np.isfinite(smooth.midpoint_error_mm)
     return int(entries.sum() + middles.sum())
@@ -210,14 +211,14 @@ def _worst(measured: Measured, values: Float, limit: float) -> Iterator[Metric]:
 
 def _balance_metrics(evidence: Evidence) -> Iterator[Metric]:
     for kind, poses in (("raw", evidence.raw.poses), ("smoothed", evidence.smooth.poses)):
-        values = poses.equilibrium_residual[usable(poses)]
+        values = poses.equilibrium_residual[usable_entries(poses)]
         if np.isfinite(values).any():
             meaning = "How far the contact forces are from balance, median; 0 is perfect rest, 1 is none."
             title = f"Equilibrium of {kind} poses"
             yield info(Measured(f"equilibrium_{kind}", title, float(np.nanmedian(values)), "", meaning))
     poses = evidence.smooth.poses
     for side, gap in (("medial", poses.medial_gap_mm), ("lateral", poses.lateral_gap_mm)):
-        values = gap[usable(poses)]
+        values = gap[usable_entries(poses)]
         if np.isfinite(values).any():
             meaning = f"Largest distance left on the {side} side; both sides touch only where the varus fits."
             yield info(Measured(f"{side}_gap", f"Largest {side} gap", float(np.nanmax(values)), "mm", meaning))

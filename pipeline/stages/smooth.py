@@ -15,7 +15,7 @@ from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, 
 from pipeline.errors import CaseRejected
 from pipeline.kinematics.cell import Cell
 from pipeline.kinematics.contact import Bodies, Pose
-from pipeline.kinematics.interpolation import found_at, pose_curves
+from pipeline.kinematics.interpolation import found_at, pose_curves, usable_entries
 from pipeline.kinematics.smoothing import Probe, ends, entries, fit_curves, settle, way_to_contact
 from pipeline.kinematics.sweep import pose_table
 from pipeline.kinematics.table import Float, Grid, PoseTable, RawTable, SmoothTable, Status
@@ -74,7 +74,7 @@ def _smoothed(raw: RawTable, degree_varus: int, params: Params, pair: ContactPai
 
 
 def _shown(table: SmoothTable) -> int:
-    return int((table.poses.status <= Status.SMOOTHED).sum())
+    return int(usable_entries(table.poses).sum())
 
 
 def _worst_midpoint(table: SmoothTable) -> float:
