@@ -84,8 +84,8 @@ class RawTable:
         Proof on both sides: pulled back by ``gap_before_mm`` the bodies are clear, pushed on by ``gap_after_mm``
         they intersect (exact triangle test).
     hysteresis_mm, hysteresis_deg : (F, V) float64
-        Way out against way back (along flexion at neutral varus, along varus elsewhere): length of the difference of (x, y, z), and of the rotation; NaN where not both
-        are usable.
+        Way out against way back (along flexion at neutral varus, along varus elsewhere): length of the difference of
+        (x, y, z), and of the rotation; NaN where not both are usable.
     """
 
     grid: Grid

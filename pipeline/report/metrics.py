@@ -104,7 +104,7 @@ def _sweep_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
     raw = evidence.raw
     found = usable_entries(raw.poses)
     shown = usable_entries(evidence.smooth.poses)
-    meaning = "Attitudes that may be shown: stable, or marked as smoothed over between stable ones; the others are never shown."
+    meaning = "Attitudes that may be shown: stable, or marked as smoothed over between stable ones."
     cells = Measured("usable_cells", "Usable entries of the table", float(shown.sum()), "entries", meaning)
     yield at_least(cells, shown.size)
     for status in Status:
@@ -125,7 +125,10 @@ def _sweep_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
 
 def _repeatability_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
     raw = evidence.raw
-    meaning = "Difference of the way out and the way back, largest (bending at neutral varus, opening elsewhere); below 1 mm and 2 deg in the literature."
+    meaning = (
+        "Largest difference of the way out and the way back (bending at neutral varus, opening elsewhere); "
+        "below 1 mm and 2 deg in the literature."
+    )
     for values, unit in ((raw.hysteresis_mm, "mm"), (raw.hysteresis_deg, "deg")):
         if np.isfinite(values).any():
             title = f"Hysteresis ({'shift' if unit == 'mm' else 'rotation'})"
