@@ -17,7 +17,8 @@ RUN /opt/ct2lut/bin/pip install --no-cache-dir --require-hashes --requirement re
 COPY pyproject.toml README.md LICENSE ./
 COPY pipeline pipeline
 RUN /opt/ct2lut/bin/pip install --no-cache-dir --no-deps --no-build-isolation . \
-    && /opt/ct2lut/bin/pip uninstall --yes cython setuptools wheel pip
+    && /opt/ct2lut/bin/pip uninstall --yes cython setuptools wheel pip \
+    && NUMBA_CPU_NAME=generic /opt/ct2lut/bin/ct2lut compile
 
 FROM ${BASE}
 # EGL with the software renderer: pictures without a display or a graphics card
@@ -29,6 +30,8 @@ COPY --from=build /opt/ct2lut /opt/ct2lut
 ENV PATH=/opt/ct2lut/bin:$PATH \
     PYTHONSAFEPATH=1 \
     PYTHONDONTWRITEBYTECODE=1 \
+    NUMBA_CPU_NAME=generic \
+    NUMBA_CACHE_LOCATOR_CLASSES=pipeline.adapters.kernel_cache.ShippedKernels,InTreeCacheLocator,UserWideCacheLocator \
     VTK_DEFAULT_OPENGL_WINDOW=vtkEGLRenderWindow \
     HOME=/tmp \
     MPLCONFIGDIR=/tmp/matplotlib \

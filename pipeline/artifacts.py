@@ -5,13 +5,24 @@ from __future__ import annotations
 from pipeline.engine.artifacts import folder
 from pipeline.engine.records import record_artifact
 from pipeline.files.arrays import array_artifact, label_volume_artifact, mesh_artifact, mesh_set_artifact
+from pipeline.kinematics.neutral import NeutralCurve
 from pipeline.kinematics.table import RawTable, SmoothTable
-from pipeline.records import Anatomy, CaseFacts, MeshQuality, ScanReturn, SurfaceOrigin, Verdict
+from pipeline.records import (
+    Anatomy,
+    CaseFacts,
+    LigamentFibre,
+    MeshQuality,
+    ScanReturn,
+    SurfaceOrigin,
+    SweepFacts,
+    Verdict,
+)
 
 # 10_intake
 CASE_FACTS = record_artifact("case_facts", "case.json", CaseFacts)
 LABELS = label_volume_artifact("labels", "labels.nrrd")  # None where the case brought meshes
 GIVEN_MESHES = mesh_set_artifact("given_meshes", "given_meshes.npz")  # empty where the case brought labels
+LIGAMENTS = record_artifact("ligaments", "ligaments.json", tuple[LigamentFibre, ...])  # empty where it brought none
 
 # 30_mesh
 MESHES = mesh_set_artifact("meshes", "meshes.npz")
@@ -27,6 +38,8 @@ SURFACE_ORIGINS = record_artifact("surface_origins", "surface_origins.json", tup
 
 # 60_sweep
 RAW_TABLE = array_artifact("raw_table", "raw_table.npz", RawTable)
+NEUTRAL_CURVE = array_artifact("neutral_curve", "neutral_curve.npz", NeutralCurve)
+SWEEP_FACTS = record_artifact("sweep_facts", "sweep_facts.json", SweepFacts)
 SCAN_RETURNS = record_artifact("scan_returns", "scan_returns.json", tuple[ScanReturn, ...])
 
 # 70_smooth

@@ -235,6 +235,16 @@ def phantom(
     _say(f"made the case {place}")
 
 
+@app.command(name="compile")
+def compile_solver() -> int:
+    """Compile the solver, once after installing: no patient has to wait for it then."""
+    from pipeline.kinematics.direct.warm_up import warm_up
+
+    _say("compiling the solver (once, about a minute)")
+    _say(f"the solver is ready ({warm_up():.0f} s)")
+    return ExitCode.PASS
+
+
 def _request(case_id: str, cases: Path, results: Path, protocol: str, overrides: Sequence[str] | None) -> Request:
     from pipeline.request import Request
 

@@ -7,11 +7,37 @@ from pydantic import Field
 
 from pipeline.adapters.contact_pool import ContactPair
 from pipeline.engine.stage import StrictParams
+from pipeline.errors import CaseRejected
 from pipeline.geometry.mesh import TriangleMesh
-from pipeline.kinematics.body_frames import in_frame
+from pipeline.kinematics.body_frames import in_frame, ligaments_in_frames, stray_fibre
 from pipeline.kinematics.cell import ProofSettings
 from pipeline.kinematics.descent import MotionSettings
-from pipeline.records import Anatomy
+from pipeline.kinematics.ligaments import NO_FIBRES, Fibres
+from pipeline.records import Anatomy, LigamentFibre
+
+
+def fibres_of(
+    ligaments: tuple[LigamentFibre, ...], anatomy: Anatomy, pair: ContactPair, push_n: float, reference_strain: float
+) -> Fibres:
+    """The fibres of a case as solvers take them; none for a push of 0.
+
+    Raises
+    ------
+    CaseRejected
+        E-LIG-03 where a fibre ends far from its body.
+    """
+    if push_n == 0.0:
+        return NO_FIBRES
+    frames = np.asarray(anatomy.scan_from_reference), np.asarray(anatomy.scan_from_moving)
+    known = ligaments_in_frames(ligaments, *frames, reference_strain)
+    stray = stray_fibre(known, pair.reference, pair.moving)
+    if stray is not None:
+        raise CaseRejected(
+            "E-LIG-03",
+            f"The ligaments do not belong to this joint: {stray}",
+            "Check that ligaments.csv is in LPS millimetres of this scan (3D Slicer writes RAS unless told otherwise).",
+        )
+    return known.fibres(push_n)
 
 
 class ContactParams(StrictParams):
@@ -28,7 +54,7 @@ class ContactParams(StrictParams):
 
     def proof(self) -> ProofSettings:
         """How a pose is proven."""
-        return ProofSettings(contact_band_mm=self.contact_band_mm)
+        return ProofSettings(contact_band_mm=self.contact_band_mm, eminence_mm=self.eminence_mm)
 
     def pair(self, reference: TriangleMesh, moving: TriangleMesh, anatomy: Anatomy) -> ContactPair:
         """Both bodies (scan space) in their kinematic frames."""

@@ -48,6 +48,10 @@ class PipelineError(Exception):
         self.problem = problem
         self.action = action
 
+    def __reduce__(self) -> tuple[type[PipelineError], tuple[str, str, str]]:
+        """How a worker process sends it home."""
+        return type(self), (self.code, self.problem, self.action)
+
 
 class ConfigError(PipelineError):
     """Usage or settings are wrong; nothing was done."""

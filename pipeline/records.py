@@ -57,6 +57,28 @@ class CaseFacts:
 
 
 @dataclass(frozen=True)
+class LigamentFibre:
+    """One fibre of a ligament, as the case gives it.
+
+    Attributes
+    ----------
+    name : str
+    reference, moving : Vector
+        Attachments on the two bodies at the pose of the scan, LPS mm.
+    slack_mm : float or None
+        Length at which it begins to pull; None where only the scan is known.
+    stiffness_n : float or None
+        Pull (N) per unit of strain; None for a cord, which does not stretch.
+    """
+
+    name: str
+    reference: Vector
+    moving: Vector
+    slack_mm: float | None
+    stiffness_n: float | None
+
+
+@dataclass(frozen=True)
 class MeshQuality:
     """How well one mesh stands for its label.
 
@@ -157,6 +179,69 @@ class ScanReturn:
     shift_mm: float
     rotation_deg: float
     sinking_mm: float
+
+
+@dataclass(frozen=True)
+class JumpCount:
+    """Neighbouring attitudes whose poses jump, and the largest difference between any two neighbours.
+
+    Attributes
+    ----------
+    count : int
+    largest_mm, largest_deg : float
+        Of (x, y), and of the rotation.
+    """
+
+    count: int
+    largest_mm: float
+    largest_deg: float
+
+
+@dataclass(frozen=True)
+class CrossCheck:
+    """A sample of the cells solved by the other solver from the same start.
+
+    Attributes
+    ----------
+    cells, agreeing, shallower : int
+        Compared; equal within the other's resolutions; where the table's pose is less deep.
+    shift_mm, rotation_deg : float
+        Largest differences.
+    deeper_mm, shallower_mm : float
+        How much deeper, and shallower, the table's pose is at most.
+    """
+
+    cells: int
+    agreeing: int
+    shallower: int
+    shift_mm: float
+    rotation_deg: float
+    deeper_mm: float
+    shallower_mm: float
+
+
+@dataclass(frozen=True)
+class SweepFacts:
+    """What is known of a sweep as a whole.
+
+    Attributes
+    ----------
+    solver : str
+    push_n : float
+        Push along delta against which ligament fibres pulled; 0 where they took no part.
+    reference_strain : float
+        How far fibres without a slack length of their own were stretched at the scan pose.
+    jumps_before, jumps_after : JumpCount
+        As first found, and after jumps were solved again from both sides.
+    cross_check : CrossCheck
+    """
+
+    solver: Literal["direct", "incremental"]
+    push_n: float
+    reference_strain: float
+    jumps_before: JumpCount
+    jumps_after: JumpCount
+    cross_check: CrossCheck
 
 
 @dataclass(frozen=True)

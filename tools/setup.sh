@@ -60,5 +60,6 @@ check_python
 install_packages
 echo "installing Python packages into .venv (about 1.5 GB, a few minutes)"
 install_project || stop "The Python packages could not be installed." "Check the network and the free disk space, then run it again."
+.venv/bin/ct2lut compile || stop "The solver could not be compiled." "Type: .venv/bin/ct2lut compile"
 wanted "$lock" >"$stamp"
 wanted requirements.lock >.venv/.setup-run # the developers' lock contains the other

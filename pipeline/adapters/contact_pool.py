@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from multiprocessing import get_context
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from pipeline.errors import EnvironmentFault
+from pipeline.adapters.workers import map_in_order
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.kinematics.contact import Bodies
 
@@ -58,39 +56,8 @@ def map_contact(
         Told the index of each finished task, in the order they finish.
     """
     if jobs <= 1 or len(tasks) <= 1:
-        return _in_this_process(work, tasks, pair, done)
-    workers = min(jobs, len(tasks))
-    with ProcessPoolExecutor(workers, get_context("spawn"), initializer=_build, initargs=(pair,)) as pool:
-        try:
-            futures = [pool.submit(_run, work, task) for task in tasks]
-            _report(futures, done)
-            return [future.result() for future in futures]
-        except BrokenProcessPool as error:
-            raise EnvironmentFault(
-                "E-ENV-30",
-                "A worker process ended before its work was done; most often the memory did not suffice.",
-                "Run again with fewer workers (--jobs 1), or on a computer with more memory.",
-            ) from error
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-
-
-def _in_this_process(
-    work: Callable[[Bodies, T], R], tasks: Sequence[T], pair: ContactPair, done: Callable[[int], None]
-) -> list[R]:
-    bodies, results = pair.bodies(), []
-    for index, task in enumerate(tasks):
-        results.append(work(bodies, task))
-        done(index)
-    return results
-
-
-def _report(futures: list[Future[R]], done: Callable[[int], None]) -> None:
-    index = {future: k for k, future in enumerate(futures)}
-    for future in as_completed(futures):
-        future.result()
-        done(index[future])
+        return map_in_order(partial(work, pair.bodies()), tasks, 1, done)
+    return map_in_order(partial(_run, work), tasks, jobs, done, partial(_build, pair))
 
 
 def _build(pair: ContactPair) -> None:

@@ -18,6 +18,7 @@ Float = NDArray[np.float64]
 
 #: More intersecting pairs than any pose near contact has; FCL needs a bound.
 MAX_PAIRS = 100_000
+_UNIT = np.eye(3)
 
 
 class FclBodies:
@@ -75,8 +76,8 @@ class FclBodies:
 
 
 def _transform(rotation: Float, shift: Float) -> fcl.Transform:
-    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
-    if not (np.isfinite(shift).all() and orthonormal and np.linalg.det(rotation) > 0.0):
+    askew = np.abs(rotation @ rotation.T - _UNIT).max()
+    if not (askew < 1e-9 and np.linalg.det(rotation) > 0.0 and np.isfinite(shift).all()):
         raise ValueError("a placement is a proper rotation (3, 3) and a finite shift (3,)")
     return fcl.Transform(rotation, shift)
 

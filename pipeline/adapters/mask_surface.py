@@ -10,16 +10,18 @@ mask with 50 iterations of pass band 0.01 was the smoothest for the same wear of
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.adapters.vtk_surface import decimate_quadric, label_surface, smooth_windowed_sinc
+from pipeline.adapters.workers import map_in_order
 from pipeline.geometry.decimation import decimate
 from pipeline.geometry.deviation import Deviation, deviation
 from pipeline.geometry.mesh import TriangleMesh, check_closed, components, genus, transformed, volume_mm3
-from pipeline.geometry.voxel_mask import framed, without_cavities, without_gaps, without_specks
+from pipeline.geometry.voxel_mask import framed, shifted_index, without_cavities, without_gaps, without_specks
 
 Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -85,6 +87,40 @@ class SurfaceResult:
         return volume_mm3(self.mesh) / self.mask_volume_mm3 - 1.0
 
 
+@dataclass(frozen=True, eq=False)
+class SurfaceTask:
+    """What :func:`mask_to_mesh` is called with; a worker process is sent it, so the masks should be no larger than need
+    be.
+    """
+
+    mask: Mask
+    lps_from_index: Float
+    settings: SurfaceSettings
+    keep_out: Mask
+
+
+def meshes_of(
+    tasks: Sequence[SurfaceTask], jobs: int, done: Callable[[int], None] = lambda _: None
+) -> list[SurfaceResult | ValueError]:
+    """The mesh of each task, or why it has none, over ``jobs`` processes; the largest first is quickest.
+
+    Parameters
+    ----------
+    tasks : sequence of SurfaceTask
+    jobs : int
+    done : callable
+        Told the index of each finished task.
+    """
+    return map_in_order(_attempted, tasks, jobs, done)
+
+
+def _attempted(task: SurfaceTask) -> SurfaceResult | ValueError:
+    try:
+        return mask_to_mesh(task.mask, task.lps_from_index, task.settings, task.keep_out)
+    except ValueError as error:
+        return error
+
+
 def mask_to_mesh(
     mask: Mask, lps_from_index: Float, settings: SurfaceSettings, keep_out: Mask | None = None
 ) -> SurfaceResult:
@@ -115,7 +151,7 @@ def mask_to_mesh(
     mended, surface = _mended_surface(frame.inside, blocked, np.diag([*spacing, 1.0]))
     mask_volume = float(np.count_nonzero(mended) * spacing.prod())
     mesh, pass_band = _smooth_and_light(surface, mask_volume, settings)
-    lps_from_grid = lps_from_index @ _shift(frame.offset) @ np.diag([*(1.0 / spacing), 1.0])
+    lps_from_grid = shifted_index(lps_from_index, frame.offset) @ np.diag([*(1.0 / spacing), 1.0])
     return SurfaceResult(
         mesh=transformed(mesh, lps_from_grid),
         pieces=len(components(mesh)),
@@ -125,13 +161,6 @@ def mask_to_mesh(
         removed_voxels=int(np.count_nonzero(frame.inside & ~mended)),
         filled_voxels=int(np.count_nonzero(mended & ~frame.inside)),
     )
-
-
-def _shift(offset: tuple[int, int, int]) -> Float:
-    """(4, 4) from framed index to index."""
-    matrix = np.eye(4)
-    matrix[:3, 3] = offset
-    return matrix
 
 
 def _mended_surface(mask: Mask, keep_out: Mask, grid_from_index: Float) -> tuple[Mask, TriangleMesh]:

@@ -26,6 +26,8 @@ PAPER: Color = (255, 255, 255)
 GREY: Color = (110, 110, 110)
 
 REGULAR, BOLD = 400, 700
+#: Effort of compression, 0 to 9: 9 makes files of 2 % less and takes three times as long as 6.
+PNG_LEVEL = 6
 #: Sub-pixel bits that OpenCV's anti-aliased drawing takes.
 _SHIFT = 4
 
@@ -166,7 +168,7 @@ def png(image: Image) -> bytes:
 
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"expected a picture (H, W, 3) of uint8, got {image.shape} of {image.dtype}")
-    done, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    done, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])
     if not done:
         raise ValueError("the picture cannot be written as PNG")
     return data.tobytes()

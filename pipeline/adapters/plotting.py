@@ -64,6 +64,7 @@ def charts_png(heading: str, footer: str, charts: Sequence[Chart], columns: int 
     columns : int
     """
     import matplotlib  # noqa: PLC0415
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     rows = -(-len(charts) // columns)
@@ -78,7 +79,8 @@ def charts_png(heading: str, footer: str, charts: Sequence[Chart], columns: int 
         figure.legend(handles.values(), handles.keys(), loc="outside lower left", ncols=7, frameon=False)
         figure.supxlabel(footer, x=0.99, ha="right", fontsize=10, fontweight="bold", color="#6e6e6e")
         data = io.BytesIO()
-        figure.savefig(data, format="png", metadata={"Software": None})
+        # what savefig does, but for laying the charts out and drawing them twice
+        FigureCanvasAgg(figure).print_png(data, metadata={"Software": None})  # type: ignore[no-untyped-call]
     return data.getvalue()
 
 

@@ -1,8 +1,9 @@
-"""Off-screen pictures of surfaces, with PyVista on VTK and Mesa's software renderer.
+"""Off-screen pictures of surfaces, with VTK and Mesa's software renderer.
 
-Three traps are dealt with here. VTK kills the process where no renderer is installed, so a child process tries first.
-A screenshot returns the frame before the last change unless the scene is rendered again, so there is one function
-that takes pictures. And VTK indexes arrays unchecked, so surfaces are checked before it sees them.
+Three traps are dealt with here. VTK kills the process where no renderer is installed: a child process tries first, but
+not on behalf of a worker process, whose end is noticed by the one that waits for it. The pixels are those of the frame
+before the last change unless the scene is rendered again, so there is one function that takes pictures. And VTK indexes
+arrays unchecked, so surfaces are checked before it sees them.
 """
 
 from __future__ import annotations
@@ -13,12 +14,14 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.adapters.vtk_surface import VtkError, polydata, vtk_errors_raised
 from pipeline.errors import EnvironmentFault
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.geometry.views import View
@@ -32,6 +35,8 @@ RENDER_WINDOW = "vtkEGLRenderWindow"
 PROBE_SECONDS = 120.0
 #: How far the camera stands away; a parallel projection does not depend on it, only what is clipped does.
 CAMERA_MM = 2000.0
+#: Samples a pixel, which smooth the edges.
+SAMPLES = 8
 
 _PROBE = f"import {__name__} as rendering; rendering.draw_one_frame()"
 
@@ -77,18 +82,13 @@ def snapshots(surfaces: Sequence[Surface], views: Sequence[View], size_px: tuple
     """
     for surface in surfaces:
         _check(surface)
-    require_renderer()
-    import pyvista  # noqa: PLC0415  - half a second and 600 MB that a cached run must not pay for
-
-    plotter = pyvista.Plotter(off_screen=True, window_size=list(size_px), lighting="light kit")
+    if parent_process() is None:
+        require_renderer()
     try:
-        with pyvista.VtkErrorCatcher(raise_errors=True):
-            _fill(plotter, surfaces)
-            return [_snapshot(plotter, view) for view in views]
-    except RuntimeError as error:
+        with vtk_errors_raised(warnings=False):
+            return _drawn(surfaces, views, size_px)
+    except VtkError as error:
         raise EnvironmentFault("E-ENV-11", f"Drawing failed: {error}.", "Run again; if it stays, report it.") from error
-    finally:
-        plotter.close()
 
 
 def _check(surface: Surface) -> None:
@@ -99,34 +99,72 @@ def _check(surface: Surface) -> None:
         raise ValueError("a surface to draw has a triangle with a vertex index out of range")
 
 
-def _fill(plotter: Any, surfaces: Sequence[Surface]) -> None:
-    plotter.set_background("white")
-    plotter.enable_anti_aliasing("msaa")
-    plotter.enable_parallel_projection()
+def _drawn(surfaces: Sequence[Surface], views: Sequence[View], size_px: tuple[int, int]) -> list[Image]:
+    window, renderer = _window()
+    window.SetSize(*size_px)
     for surface in surfaces:
-        _add(plotter, surface)
+        renderer.AddActor(_actor(surface))
+    try:
+        return [_snapshot(window, renderer, view) for view in views]
+    finally:
+        renderer.RemoveAllViewProps()
 
 
-def _add(plotter: Any, surface: Surface) -> None:
-    import pyvista  # noqa: PLC0415
+@functools.cache
+def _window() -> tuple[Any, Any]:
+    """The one window of this process, with white background, and its renderer: a new one compiles its shaders again."""
+    os.environ["VTK_DEFAULT_OPENGL_WINDOW"] = RENDER_WINDOW
+    from vtkmodules import vtkRenderingCore, vtkRenderingOpenGL2  # noqa: F401, PLC0415 - the second registers itself
 
-    faces = np.insert(surface.mesh.triangles.astype(np.int64), 0, 3, axis=1)
-    poly = pyvista.PolyData(surface.mesh.points, faces.ravel())
-    colors = np.broadcast_to(surface.color, surface.mesh.points.shape).astype(np.uint8)
-    light = {"ambient": 0.55, "diffuse": 0.5} if surface.plain else {"ambient": 0.12, "diffuse": 0.95}
-    plotter.add_mesh(poly, scalars=colors, rgb=True, smooth_shading=True, render=False, **light)
+    window, renderer = vtkRenderingCore.vtkRenderWindow(), vtkRenderingCore.vtkRenderer()
+    window.SetOffScreenRendering(1)
+    window.SetMultiSamples(SAMPLES)
+    window.AddRenderer(renderer)
+    renderer.SetBackground(1.0, 1.0, 1.0)
+    renderer.GetActiveCamera().ParallelProjectionOn()
+    renderer.AutomaticLightCreationOff()
+    lights = vtkRenderingCore.vtkLightKit()
+    lights.AddLightsToRenderer(renderer)
+    lights.Update()
+    return window, renderer
 
 
-def _snapshot(plotter: Any, view: View) -> Image:
-    camera = plotter.camera
-    camera.focal_point = tuple(view.focus)
-    camera.position = tuple(view.focus + CAMERA_MM * view.toward)
-    camera.up = tuple(view.up)
-    camera.parallel_scale = view.half_height_mm
-    plotter.reset_camera_clipping_range()
-    # Without this the screenshot is the frame before the camera moved.
-    plotter.render()
-    return np.ascontiguousarray(plotter.screenshot(return_img=True), dtype=np.uint8)[..., :3]
+def _actor(surface: Surface) -> Any:
+    from vtkmodules.util.numpy_support import numpy_to_vtk  # noqa: PLC0415
+    from vtkmodules.vtkFiltersCore import vtkPolyDataNormals  # noqa: PLC0415
+    from vtkmodules.vtkRenderingCore import vtkActor, vtkPolyDataMapper  # noqa: PLC0415
+
+    data, normals, mapper, actor = polydata(surface.mesh), vtkPolyDataNormals(), vtkPolyDataMapper(), vtkActor()
+    colors = np.broadcast_to(surface.color, surface.mesh.points.shape)
+    data.GetPointData().SetScalars(numpy_to_vtk(np.ascontiguousarray(colors, dtype=np.uint8), deep=True))
+    normals.SetInputData(data)
+    normals.SplittingOff()
+    normals.ConsistencyOff()
+    mapper.SetInputConnection(normals.GetOutputPort())
+    actor.SetMapper(mapper)
+    look = actor.GetProperty()
+    look.SetInterpolationToPhong()
+    look.SetAmbient(0.55 if surface.plain else 0.12)
+    look.SetDiffuse(0.5 if surface.plain else 0.95)
+    # surfaces are closed: what faces away is hidden, and half of the work
+    look.BackfaceCullingOn()
+    return actor
+
+
+def _snapshot(window: Any, renderer: Any, view: View) -> Image:
+    from vtkmodules.util.numpy_support import vtk_to_numpy  # noqa: PLC0415
+    from vtkmodules.vtkCommonCore import vtkUnsignedCharArray  # noqa: PLC0415
+
+    camera, pixels, (width, height) = renderer.GetActiveCamera(), vtkUnsignedCharArray(), window.GetSize()
+    camera.SetFocalPoint(*view.focus)
+    camera.SetPosition(*(view.focus + CAMERA_MM * view.toward))
+    camera.SetViewUp(*view.up)
+    camera.SetParallelScale(view.half_height_mm)
+    renderer.ResetCameraClippingRange()
+    window.Render()
+    # 1: the front buffer, where the samples of a pixel have been put together as on a screen
+    window.GetPixelData(0, 0, width - 1, height - 1, 1, pixels, 0)
+    return np.ascontiguousarray(vtk_to_numpy(pixels).reshape(height, width, 3)[::-1])
 
 
 def distances_mm(points: Float, mesh: TriangleMesh) -> Float:
@@ -138,16 +176,17 @@ def distances_mm(points: Float, mesh: TriangleMesh) -> Float:
         When the mesh is empty, not finite, or has an index out of range.
     """
     _check(Surface(mesh, np.zeros(3, dtype=np.uint8)))
-    import pyvista  # noqa: PLC0415
+    from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy  # noqa: PLC0415
+    from vtkmodules.vtkCommonCore import vtkDoubleArray  # noqa: PLC0415
+    from vtkmodules.vtkFiltersCore import vtkImplicitPolyDataDistance  # noqa: PLC0415
 
     if not len(points):
         return np.empty(0)
-    faces = np.insert(mesh.triangles.astype(np.int64), 0, 3, axis=1)
-    surface = pyvista.PolyData(mesh.points, faces.ravel())
-    cloud = pyvista.PolyData(np.asarray(points, dtype=np.float64))
-    with pyvista.VtkErrorCatcher(raise_errors=True):
-        measured = cloud.compute_implicit_distance(surface)
-    return np.asarray(measured["implicit_distance"], dtype=np.float64)
+    surface, measured = vtkImplicitPolyDataDistance(), vtkDoubleArray()
+    with vtk_errors_raised(warnings=False):
+        surface.SetInput(polydata(mesh))
+        surface.FunctionValue(numpy_to_vtk(np.ascontiguousarray(points, dtype=np.float64), deep=True), measured)
+    return np.array(vtk_to_numpy(measured))
 
 
 @functools.cache
@@ -159,7 +198,6 @@ def require_renderer() -> None:
     EnvironmentFault
         ``E-ENV-10`` when the child crashes, fails or hangs.
     """
-    os.environ["VTK_DEFAULT_OPENGL_WINDOW"] = RENDER_WINDOW
     how = _probe_failure()
     if how:
         raise EnvironmentFault(
@@ -171,7 +209,8 @@ def require_renderer() -> None:
 
 def _probe_failure() -> str:
     root = str(Path(__file__).resolve().parents[2])
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")]).rstrip(":")}
+    path = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")]).rstrip(":")
+    environment = os.environ | {"PYTHONPATH": path, "VTK_DEFAULT_OPENGL_WINDOW": RENDER_WINDOW}
     try:
         done = subprocess.run(  # noqa: S603  - our own interpreter with a constant text
             [sys.executable, "-P", "-c", _PROBE],

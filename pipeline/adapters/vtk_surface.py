@@ -22,8 +22,8 @@ class VtkError(RuntimeError):
 
 
 @contextmanager
-def vtk_errors_raised() -> Iterator[None]:
-    """Within the block every error and warning of VTK is collected, and raised at its end.
+def vtk_errors_raised(*, warnings: bool = True) -> Iterator[None]:
+    """Within the block what VTK says is collected; at its end, errors (and ``warnings``, if wanted) are raised.
 
     Raises
     ------
@@ -41,8 +41,9 @@ def vtk_errors_raised() -> Iterator[None]:
     finally:
         vtkLogger.SetStderrVerbosity(verbosity)
         vtkOutputWindow.SetInstance(previous)
-    if window.GetOutput().strip():
-        raise VtkError(window.GetOutput().strip())
+    said = window.GetOutput().strip()
+    if said if warnings else "ERROR:" in said:
+        raise VtkError(said)
 
 
 def label_surface(mask: NDArray[np.bool_], lps_from_index: Float) -> TriangleMesh:
@@ -156,12 +157,16 @@ def _image(mask: NDArray[np.bool_]) -> Any:
 
 
 def _polydata(mesh: TriangleMesh) -> Any:
-    """VTK's copy of a checked mesh, in double precision."""
+    check_arrays(mesh, "the mesh")
+    return polydata(mesh)
+
+
+def polydata(mesh: TriangleMesh) -> Any:
+    """VTK's copy of a mesh, in double precision; unchecked, and VTK reads an index out of range as memory."""
     from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray  # noqa: PLC0415
     from vtkmodules.vtkCommonCore import vtkPoints  # noqa: PLC0415
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData  # noqa: PLC0415
 
-    check_arrays(mesh, "the mesh")
     points, cells, data = vtkPoints(), vtkCellArray(), vtkPolyData()
     points.SetData(numpy_to_vtk(np.ascontiguousarray(mesh.points), deep=True))
     offsets = np.arange(0, mesh.triangles.size + 1, 3, dtype=np.int64)

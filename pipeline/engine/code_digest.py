@@ -23,6 +23,7 @@ from pipeline.engine.stage import Stage
 #: Packages that decide numbers or bytes; an upgrade of one recomputes every stage.
 NUMERIC_PACKAGES = (
     "numpy",
+    "numba",
     "scipy",
     "vtk",
     "pyvista",

@@ -8,6 +8,7 @@ from pathlib import PurePosixPath
 
 from pipeline.engine.artifacts import SourceFolder
 from pipeline.errors import CaseRejected
+from pipeline.files.ligaments_file import LIGAMENTS_FILE
 from pipeline.files.markups import MARKUP_ENDINGS
 from pipeline.files.meshes import MESH_ENDINGS
 from pipeline.files.volumes import DETACHED_ENDINGS, LABEL_MAP_ENDINGS
@@ -27,20 +28,23 @@ class CaseFiles:
     meshes : mapping of str to str
         Structure name -> file; empty where the case brought a label map.
     landmarks : str or None
+    ligaments : str or None
     """
 
     label_map: str | None
     meshes: Mapping[str, str]
     landmarks: str | None
+    ligaments: str | None
 
     @property
     def names(self) -> tuple[str, ...]:
         """All of them."""
-        return tuple(name for name in (self.label_map, *self.meshes.values(), self.landmarks) if name is not None)
+        chosen = (self.label_map, *self.meshes.values(), self.landmarks, self.ligaments)
+        return tuple(name for name in chosen if name is not None)
 
 
 def choose_files(names: Iterable[str]) -> CaseFiles:
-    """The label map or the meshes, and the landmarks, among the files of a case folder.
+    """The label map or the meshes, the landmarks and the ligaments among the files of a case folder.
 
     Raises
     ------
@@ -50,17 +54,16 @@ def choose_files(names: Iterable[str]) -> CaseFiles:
     top = sorted(name for name in names if "/" not in name)
     maps = [name for name in top if _is_label_map(name.lower())]
     meshes = sorted(name for name in names if name.startswith("meshes/") and name.lower().endswith(MESH_ENDINGS))
-    landmarks = [name for name in top if name.lower().endswith(MARKUP_ENDINGS)]
     if not maps and not meshes:
         raise _no_segmentation(top)
     if len(maps) > 1 or (maps and meshes):
         raise _several("segmentation", [*maps, *meshes[:1]])
-    if len(landmarks) > 1:
-        raise _several("landmark file", landmarks)
     by_structure = {PurePosixPath(name).stem: name for name in meshes}
     if len(by_structure) != len(meshes):
         raise _several("mesh of one structure", meshes)
-    return CaseFiles(maps[0] if maps else None, by_structure, landmarks[0] if landmarks else None)
+    landmarks = _at_most_one("landmark file", [name for name in top if name.lower().endswith(MARKUP_ENDINGS)])
+    ligaments = _at_most_one("ligament file", [name for name in top if name.lower() == LIGAMENTS_FILE])
+    return CaseFiles(maps[0] if maps else None, by_structure, landmarks, ligaments)
 
 
 def read_file(source: SourceFolder, name: str) -> bytes:
@@ -84,6 +87,12 @@ def read_file(source: SourceFolder, name: str) -> bytes:
 def _is_label_map(name: str) -> bool:
     endings = LABEL_MAP_ENDINGS + DETACHED_ENDINGS  # the latter so that their reader can say why not
     return name.endswith(".seg.nrrd") or (name.startswith("labels.") and name.endswith(endings))
+
+
+def _at_most_one(what: str, names: list[str]) -> str | None:
+    if len(names) > 1:
+        raise _several(what, names)
+    return names[0] if names else None
 
 
 def _no_segmentation(top: list[str]) -> CaseRejected:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.kinematics.interpolation import found_coordinates, usable_entries
+from pipeline.kinematics.neutral import NeutralCurve
 from pipeline.kinematics.table import Grid, LutTable, PoseTable, RawTable, SmoothTable, Status
 
 Float = NDArray[np.float64]
@@ -31,6 +32,8 @@ class LutFileContent:
         Name and version of the program that made the table.
     smooth, raw : SmoothTable, RawTable
         On one grid.
+    neutral : NeutralCurve
+        Over the grid's flexion.
     scan_from_reference, scan_from_moving : (4, 4) float64
         Kinematic frames in scan space (LPS mm); left-handed for a left joint.
     delta : (3,) float64
@@ -46,6 +49,7 @@ class LutFileContent:
     software: str
     smooth: SmoothTable
     raw: RawTable
+    neutral: NeutralCurve
     scan_from_reference: Float
     scan_from_moving: Float
     delta: Float

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pipeline.files.lut_content import LutFileContent
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.kinematics.interpolation import moved_from_scan_table
+from pipeline.kinematics.neutral import NeutralCurve
 from pipeline.kinematics.table import CurveFit, Grid, LutTable, PoseTable, RawTable, SmoothTable
 
 Array = NDArray[Any]
@@ -84,6 +85,16 @@ _LAYOUT = """
 /raw/gap_after_mm            f8 flexion_deg,varus_deg mm  gap after contact: pushed on by this, the bodies intersect
 /raw/hysteresis_mm           f8 flexion_deg,varus_deg mm  hysteresis of position: way out against way back
 /raw/hysteresis_deg          f8 flexion_deg,varus_deg deg hysteresis of rotation: way out against way back
+/raw/margin_lateral_mm       f8 flexion_deg,varus_deg mm  lateral margin: a push within which the depth keeps falling
+/raw/margin_anterior_mm      f8 flexion_deg,varus_deg mm  anterior margin: a push within which the depth keeps falling
+/raw/margin_rotation_deg     f8 flexion_deg,varus_deg deg rotation margin: a turn within which the depth keeps falling
+/neutral/varus_deg           f8 flexion_deg           deg neutral varus: at which both compartments touch
+/neutral/lateral_mm          f8 flexion_deg           mm  lateral position: at neutral varus
+/neutral/anterior_mm         f8 flexion_deg           mm  anterior position: at neutral varus
+/neutral/proximal_mm         f8 flexion_deg           mm  proximal position: at neutral varus
+/neutral/internal_rotation_deg f8 flexion_deg         deg internal rotation: at neutral varus
+/neutral/uneven_mm           f8 flexion_deg           mm  unevenness: lateral minus medial clearance along delta
+/neutral/status              u1 flexion_deg           1   status: usable where 0
 /smoothing/coefficients      f8 curve,flexion_order,varus_order 1   coefficients: in the curve's unit
 /smoothing/degrees           i4 curve,driven          1   degrees: of each curve in flexion and in varus
 /smoothing/residual_rms      f8 curve                 1   RMS residual: of raw minus fitted, in the curve's unit
@@ -103,7 +114,9 @@ _LAYOUT = """
 """
 
 #: Fields of RawTable that are arrays of their own.
-_RAW_ONLY = ("iterations", "gap_before_mm", "gap_after_mm", "hysteresis_mm", "hysteresis_deg")
+_RAW_ONLY = tuple(field.name for field in fields(RawTable) if field.name not in ("grid", "poses"))
+#: Fields of NeutralCurve; its flexion is that of the grid.
+_NEUTRAL = tuple(field.name for field in fields(NeutralCurve) if field.name != "flexion_deg")
 
 
 def _specs(line: str) -> Iterator[DatasetSpec]:
@@ -168,6 +181,7 @@ def arrays_of(content: LutFileContent) -> dict[str, Array]:
         table = LutTable(content.side, smooth.grid, poses, content.scan_from_reference, content.scan_from_moving)
         arrays[f"/{group}/moved_from_scan"] = moved_from_scan_table(table)
     arrays |= {f"/raw/{name}": getattr(raw, name) for name in _RAW_ONLY}
+    arrays |= {f"/neutral/{name}": getattr(content.neutral, name) for name in _NEUTRAL}
     for name, body in (("reference", content.reference_body), ("moving", content.moving_body)):
         arrays |= {f"/bodies/{name}/points": body.points, f"/bodies/{name}/triangles": body.triangles}
     return arrays | _fit_arrays(smooth)
@@ -220,6 +234,7 @@ def content_of(arrays: Mapping[str, Array], attributes: Mapping[str, str]) -> Lu
         software=attributes["software"],
         smooth=smooth,
         raw=RawTable(grid, _poses_of(arrays, "raw"), **{name: arrays[f"/raw/{name}"] for name in _RAW_ONLY}),
+        neutral=NeutralCurve(grid.flexion_deg, **{name: arrays[f"/neutral/{name}"] for name in _NEUTRAL}),
         **{
             name: arrays[f"/frames/{name}"]
             for name in ("scan_from_reference", "scan_from_moving", "delta", "scan_attitude")

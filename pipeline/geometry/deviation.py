@@ -50,34 +50,46 @@ def distances(points: Float, mesh: TriangleMesh) -> Float:
     from scipy.spatial import KDTree  # noqa: PLC0415 - slow to import, and runs of cached stages never need it
 
     corners = mesh.points[mesh.triangles]
-    neighbours = min(NEIGHBOURS, len(corners))
-    _, near = KDTree(corners.mean(axis=1)).query(points, k=np.arange(1, neighbours + 1))
-    squared = _squared_distances(np.repeat(points, neighbours, axis=0), corners[near.ravel()])
-    return np.asarray(np.sqrt(squared.reshape(len(points), neighbours).min(axis=1)))
+    centres = (corners[:, 0] + corners[:, 1] + corners[:, 2]) / 3.0
+    reach = np.sqrt(np.max([_squared_length((corners[:, k] - centres).T) for k in range(3)], axis=0))
+    ranks = np.arange(1, min(NEIGHBOURS, len(corners)) + 1)
+    away, near = (np.asarray(of_rank).T for of_rank in KDTree(centres, balanced_tree=False).query(points, k=ranks))
+    nearest = np.full(len(points), np.inf)
+    for distance, triangle in zip(away, near, strict=True):
+        # no part of a triangle is nearer than its centre less its reach
+        nearer = np.flatnonzero(distance - reach[triangle] < nearest)
+        found = np.sqrt(_squared_distances(points[nearer], corners[triangle[nearer]]))
+        nearest[nearer] = np.minimum(nearest[nearer], found)
+    return nearest
 
 
 def _sample(mesh: TriangleMesh) -> Float:
     return mesh.points[:: max(1, len(mesh.points) // SAMPLES)]
 
 
-def _dot(a: Float, b: Float) -> Float:
-    return np.asarray((a * b).sum(axis=-1), dtype=np.float64)
-
-
 def _squared_distances(points: Float, corners: Float) -> Float:
     """(K,) squared distance of each point (K, 3) from its triangle (K, 3, 3): in the face, else on the nearest edge."""
-    sides = [_squared_to_segment(points, corners[:, i], corners[:, (i + 1) % 3]) for i in range(3)]
-    a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    normal, to_point = np.cross(ab, ac), points - a
-    area2 = _dot(normal, normal)
-    v, w = _dot(np.cross(to_point, ac), normal), _dot(np.cross(ab, to_point), normal)
+    p, a, b, c = points.T, corners[:, 0].T, corners[:, 1].T, corners[:, 2].T
+    ab, ac, ap = b - a, c - a, p - a
+    on_edges = [_squared_to_segment(ap, ab), _squared_to_segment(ap, ac), _squared_to_segment(p - b, c - b)]
+    normal = _cross(ab, ac)
+    area2, v, w = _dot(normal, normal), _dot(_cross(ap, ac), normal), _dot(_cross(ab, ap), normal)
     above = (v >= 0.0) & (w >= 0.0) & (v + w <= area2)
-    height2 = _dot(to_point, normal) ** 2 / area2
-    return np.where(above, height2, np.minimum(np.minimum(sides[0], sides[1]), sides[2]))
+    return np.where(above, _dot(ap, normal) ** 2 / area2, np.min(on_edges, axis=0))
 
 
-def _squared_to_segment(points: Float, start: Float, end: Float) -> Float:
-    along = end - start
-    t = np.clip(_dot(points - start, along) / _dot(along, along), 0.0, 1.0)
-    away = points - start - t[:, None] * along
-    return _dot(away, away)
+def _squared_to_segment(from_start: Float, along: Float) -> Float:
+    t = np.clip(_dot(from_start, along) / _dot(along, along), 0.0, 1.0)
+    return _squared_length(from_start - t * along)
+
+
+def _squared_length(vectors: Float) -> Float:
+    return _dot(vectors, vectors)
+
+
+def _dot(a: Float, b: Float) -> Float:
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
+def _cross(a: Float, b: Float) -> Float:
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

@@ -74,7 +74,8 @@ def area_mm2(mesh: TriangleMesh) -> float:
 
 def volume_mm3(mesh: TriangleMesh) -> float:
     """Signed volume inside a closed mesh (divergence theorem); positive where normals point outward."""
-    a, b, c = (mesh.points[mesh.triangles[:, corner]] - mesh.points.mean(axis=0) for corner in range(3))
+    centred = mesh.points - mesh.points.mean(axis=0)
+    a, b, c = (centred[mesh.triangles[:, corner]] for corner in range(3))
     return float((a * np.cross(b, c)).sum() / 6.0)
 
 
@@ -134,55 +135,68 @@ def _directed_edges(triangles: Int) -> Index:
     return np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2).astype(np.intp)
 
 
+def _by_edge(directed: Index) -> tuple[Index, Index]:
+    """Corners in an order that puts those of one undirected edge side by side, and where in it each edge starts."""
+    lower, upper = np.minimum(*directed.T), np.maximum(*directed.T)
+    keys = lower * (upper.max(initial=0) + 1) + upper
+    order = np.argsort(keys)
+    return order, np.flatnonzero(np.diff(keys[order], prepend=-1))
+
+
 def edge_defects(triangles: Int) -> EdgeDefects:
     """Count the edges that keep triangles (M, 3) from being a closed, consistently oriented surface."""
     directed = _directed_edges(triangles)
-    lower, upper = directed.min(axis=1), directed.max(axis=1)
-    _, index, count = np.unique(lower * (upper.max(initial=0) + 1) + upper, return_inverse=True, return_counts=True)
-    forward = np.bincount(index, directed[:, 0] == lower, len(count))
+    order, starts = _by_edge(directed)
+    count = np.diff(starts, append=len(order))
+    forward = np.add.reduceat((directed[order, 0] <= directed[order, 1]).astype(np.intp), starts)
     pairs = count == 2
     return EdgeDefects(int((count == 1).sum()), int((count > 2).sum()), int((forward[pairs] != 1).sum()))
 
 
-def _labels(first: Index, second: Index, nodes: int) -> tuple[int, Index]:
-    """Connected components of an undirected graph of ``nodes`` nodes: their number and the one of each node."""
+def _piece_of_vertex(triangles: Int, vertices: int) -> Index:
+    """(vertices,) number of the connected piece that each vertex belongs to, in the order of their first vertex."""
     # slow to import, and runs of cached stages never need them
     from scipy.sparse import coo_array  # noqa: PLC0415
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
 
-    graph = coo_array((np.ones(len(first), dtype=np.int8), (first, second)), shape=(nodes, nodes))
-    count, labels = connected_components(graph, directed=False)
-    return int(count), np.asarray(labels, dtype=np.intp)
+    # two of its edges join the corners of a triangle
+    edges = (triangles[:, :2].ravel(), triangles[:, 1:].ravel())
+    graph = coo_array((np.ones(len(edges[0]), dtype=np.int8), edges), shape=(vertices, vertices))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp)
 
 
 def components(mesh: TriangleMesh) -> tuple[TriangleMesh, ...]:
     """Pieces of the mesh that share no vertex, in the order of their first vertex."""
-    first, second = _directed_edges(mesh.triangles).T
-    _, labels = _labels(first, second, len(mesh.points))
-    piece = labels[mesh.triangles[:, 0]]
+    piece = _piece_of_vertex(mesh.triangles, len(mesh.points))[mesh.triangles[:, 0]]
     if len(piece) == 0 or (piece == piece[0]).all():
         return (mesh,) if len(piece) else ()
     return tuple(compacted(TriangleMesh(mesh.points, mesh.triangles[piece == name])) for name in np.unique(piece))
 
 
 def pinched_vertices(triangles: Int) -> int:
-    """Number of vertices where an edge-manifold surface touches itself in a point (more than one fan of triangles)."""
+    """Number of vertices where a closed, oriented surface touches itself in a point (more than one fan of triangles).
+
+    From each corner one turns about its vertex to the next triangle; every fan of triangles is one cycle of such turns.
+    The lowest corner of a cycle is found by steps of 1, 2, 4, ... turns.
+    """
     directed = _directed_edges(triangles)
     corner = np.arange(len(directed))
     following = np.roll(corner.reshape(-1, 3), -1, axis=1).ravel()
-    key = directed.min(axis=1) * (directed.max(initial=0) + 1) + directed.max(axis=1)
-    order = np.argsort(key, kind="stable")
-    left, right = (order[k : len(order) // 2 * 2 : 2] for k in (0, 1))
-    low = np.where(directed[:, 0] < directed[:, 1], corner, following)
-    high = np.where(directed[:, 0] < directed[:, 1], following, corner)
-    fans, _ = _labels(np.r_[low[left], high[left]], np.r_[low[right], high[right]], len(directed))
-    return fans - len(np.unique(triangles))
+    here, there = _by_edge(directed)[0].reshape(-1, 2).T
+    turn = np.empty_like(corner)
+    turn[here], turn[there] = following[there], following[here]
+    corners_of = np.bincount(triangles.ravel())
+    lowest = corner
+    for _ in range(int(corners_of.max()).bit_length()):
+        lowest = np.minimum(lowest, lowest[turn])
+        turn = turn[turn]
+    return int(np.count_nonzero(lowest == corner) - np.count_nonzero(corners_of))
 
 
 def genus(mesh: TriangleMesh) -> int:
-    """Number of handles of a closed mesh, all pieces together (Euler's formula)."""
-    vertices, edges, faces = len(np.unique(mesh.triangles)), len(mesh.triangles) * 3 // 2, len(mesh.triangles)
-    return len(components(mesh)) - (vertices - edges + faces) // 2
+    """Number of handles of a closed mesh, all pieces together (Euler's formula; each edge belongs to two triangles)."""
+    vertices = int(np.count_nonzero(np.bincount(mesh.triangles.ravel())))
+    return len(components(mesh)) - (vertices - len(mesh.triangles) // 2) // 2
 
 
 def _array_defect(mesh: TriangleMesh) -> str | None:

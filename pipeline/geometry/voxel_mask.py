@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +42,31 @@ def framed(mask: Mask, like: Mask | None = None) -> FramedMask:
     box = box_of(guide)
     low, middle, high = (int(edge.start) - MARGIN for edge in box)
     return FramedMask(np.pad(mask[box], MARGIN), (low, middle, high))
+
+
+def shifted_index(lps_from_index: Float, offset: tuple[int, int, int]) -> Float:
+    """(4, 4) to LPS mm from the indices of a part whose index 0 is at ``offset`` in the whole."""
+    shift = np.eye(4)
+    shift[:3, 3] = offset
+    return np.asarray(lps_from_index @ shift)
+
+
+def voxels_of(values: NDArray[np.generic], labels: Sequence[int]) -> Mask:
+    """Where an array of labels has one of some labels."""
+    mask = np.zeros_like(values, dtype=np.bool_)
+    for label in labels:
+        mask |= values == label
+    return mask
+
+
+def part_with(volume: LabelVolume, labels: Sequence[int]) -> LabelVolume:
+    """The part of a volume that holds some labels, and MARGIN voxels of air; all of it where it has none of them."""
+    mask = voxels_of(volume.values, labels)
+    if not mask.any():
+        return volume
+    box = box_of(mask)
+    low, middle, high = (int(edge.start) - MARGIN for edge in box)
+    return LabelVolume(np.pad(volume.values[box], MARGIN), shifted_index(volume.lps_from_index, (low, middle, high)))
 
 
 def without_specks(mask: Mask) -> Mask:

@@ -18,6 +18,7 @@ from pipeline.geometry.containment import nested
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.geometry.triangles import near_features, with_neighbours
 from pipeline.kinematics.joint_coordinates import Float, attitude_rotation, rotation_z
+from pipeline.kinematics.ligaments import NO_FIBRES, NO_LOAD, Fibres, Load, fibre_load
 
 #: A wall whose normal is nearly orthogonal to delta carries no load along it; below this cosine it counts as this
 #: steep (about 1 degree), so that its reaction stays finite.
@@ -88,11 +89,22 @@ class AttitudeContact:
     ----------
     bodies : Bodies
     flexion_rad, varus_rad : float
+    fibres : Fibres
+        Attachments on the reference in its own frame.
     """
 
-    def __init__(self, bodies: Bodies, flexion_rad: float, varus_rad: float) -> None:
+    def __init__(self, bodies: Bodies, flexion_rad: float, varus_rad: float, fibres: Fibres = NO_FIBRES) -> None:
         self.bodies = bodies
         self._reference_from_attitude = attitude_rotation(flexion_rad, varus_rad)
+        self._fibres = fibres._replace(on_reference=fibres.on_reference @ self._reference_from_attitude)
+
+    def load(self, pose: Pose) -> Load:
+        """What the fibres do at ``pose``."""
+        return fibre_load(self._fibres, (pose.x, pose.y, pose.theta, pose.z))
+
+    def merit(self, pose: Pose) -> float:
+        """What a stable pose is a local maximum of: depth along delta, less the energy of the fibres, mm."""
+        return pose.z - self.load(pose).energy_mm
 
     def touches(self, pose: Pose) -> bool:
         """Whether the surfaces cross at ``pose``."""
@@ -177,22 +189,25 @@ def _distinct(points: Float, normals: Float, gaps: Float) -> NDArray[np.int64]:
     return np.unique(rounded, axis=0, return_index=True)[1]
 
 
-def reaction_rates(contacts: Contacts, pose: Pose) -> Float:
-    """(K, 3) how much farther along delta each contact lets the body go, per mm of x, mm of y and rad of theta.
+def reaction_rates(contacts: Contacts, pose: Pose, load: Load = NO_LOAD) -> Float:
+    """(K, 3) how much each contact lets the merit grow, per mm of x, mm of y and rad of theta.
 
     A motion u of the contact point keeps clear while normal . u >= 0; with u = (dx, dy, dz) + dtheta z x (r - d) that
-    is dz <= rates . (dx, dy, dtheta). The least rate over all contacts is what the motion gains.
+    is dz <= rates . (dx, dy, dtheta). Without fibres the merit is the depth; with them each mm of depth is worth what
+    they leave of the push or add to it, and the motion itself costs their slope. The least rate over all contacts is
+    what the motion gains.
     """
     n = contacts.normals
     lever = contacts.points[:, :2] - [pose.x, pose.y]
     torque = lever[:, 0] * n[:, 1] - lever[:, 1] * n[:, 0]
-    return np.column_stack([n[:, 0], n[:, 1], torque]) / _support(contacts)[:, None]
+    return load.push * np.column_stack([n[:, 0], n[:, 1], torque]) / support(contacts)[:, None] - load.slope[:3]
 
 
-def reaction_slack(contacts: Contacts) -> Float:
-    """(K,) how far along delta the body may go before each contact closes, mm."""
-    return contacts.gaps / _support(contacts)
+def reaction_slack(contacts: Contacts, load: Load = NO_LOAD) -> Float:
+    """(K,) how much the merit grows along delta before each contact closes, mm."""
+    return load.push * contacts.gaps / support(contacts)
 
 
-def _support(contacts: Contacts) -> Float:
+def support(contacts: Contacts) -> Float:
+    """(K,) share of each reaction that holds the body against delta."""
     return np.maximum(-contacts.normals[:, 2], STEEPEST_COSINE)

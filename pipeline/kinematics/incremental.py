@@ -24,6 +24,11 @@ accepting a motion
     and only a motion that closed no cycle resets a step, for else two alternating poses would reset one another's.
 spent
     A kind of motion whose step fell below its resolution is spent until a step is reset.
+ligaments
+    They pull as one more reaction does. What counts as deeper is then the merit of a pose (depth less elastic energy
+    over the push), and an advance is one of the merit. As they may pull the body uphill, a motion that meets the
+    reference goes on, and the body is pulled back along delta as far as it must. A turn about some centre has to
+    promise more than the same shift without the turn: else a body that turns freely would be dragged round and round.
 before a pose is called stable
     Trials at one resolution to either side in x, y and theta fail to go deeper, and so do joint motions (both
     translations and the rotation together, needed where only the combination advances) that a small linear programme
@@ -40,10 +45,11 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.kinematics.contact import AttitudeContact, Contacts, Pose, reaction_rates, reaction_slack
+from pipeline.kinematics.contact import AttitudeContact, Contacts, Pose, reaction_rates, reaction_slack, support
 from pipeline.kinematics.descent import MotionSettings, drop, move_until_contact
 from pipeline.kinematics.joint_coordinates import Float
 from pipeline.kinematics.least_rate import best_motion
+from pipeline.kinematics.ligaments import NO_LOAD, Load
 from pipeline.kinematics.table import Status
 
 Kind = Literal["rotation", "translation"]
@@ -52,6 +58,8 @@ KINDS: tuple[Kind, ...] = ("rotation", "translation")
 
 #: Advance along delta per unit of motion below which contacts promise nothing (rounding of the normals).
 LEAST_PROMISE = 1e-6
+#: So often a joint motion is looked for again with what was learned about the fibres.
+MOST_TANGENTS = 20
 
 
 @dataclass(frozen=True)
@@ -65,7 +73,7 @@ class IncrementalSettings:
     contact_band_mm : float
         Features closer than this react.
     gain_mm : float
-        Least advance along delta that counts as deeper; above the contact tolerance.
+        Least advance along delta that counts as deeper; above the contact tolerance. Of a merit, this much depth.
     """
 
     translation_step_mm: float = 1.0
@@ -185,8 +193,7 @@ def _out_of_bounds(search: _Search) -> Status | None:
 
 def _round(search: _Search) -> Status | Literal["equilibrium"] | None:
     """What happens at one contact pose: turn, else slide, else equilibrium."""
-    contacts = search.contact.contacts(search.pose, search.settings.contact_band_mm, along_only=True)
-    options = motion_options(contacts, search.pose)
+    options = _options(search)
     for kind in KINDS:
         while options[kind] and not search.spent(kind):
             for direction in options[kind]:
@@ -207,11 +214,19 @@ def _try(search: _Search, kind: Kind, direction: Motion) -> tuple[Pose | None, b
     step = search.steps[kind]
     motion = (direction[0] * step, direction[1] * step, direction[2] * step)
     moved, collided = move_until_contact(search.contact, search.pose, motion, search.settings.motion)
+    if collided and search.contact.load(search.pose).energy_mm > 0.0:
+        moved = search.pose.displaced(motion)  # perhaps uphill: the drop pulls it back along delta
     return drop(search.contact, moved, search.settings.motion), collided
 
 
+def _options(search: _Search) -> dict[Kind, list[Motion]]:
+    contacts = search.contact.contacts(search.pose, search.settings.contact_band_mm, along_only=True)
+    return motion_options(contacts, search.pose, search.contact.load(search.pose))
+
+
 def _deeper(search: _Search, landed: Pose) -> bool:
-    return landed.z > search.pose.z + search.settings.gain_mm
+    merit, push = search.contact.merit, search.contact.load(search.pose).push
+    return merit(landed) > merit(search.pose) + push * search.settings.gain_mm
 
 
 def _accept(search: _Search, kind: Kind, landed: Pose) -> None:
@@ -223,8 +238,7 @@ def _accept(search: _Search, kind: Kind, landed: Pose) -> None:
 
 def _classic_round(search: _Search) -> Status | Literal["equilibrium"] | None:
     """The paper's rules without the guard: the first possible motion stands, wherever it leads."""
-    contacts = search.contact.contacts(search.pose, search.settings.contact_band_mm, along_only=True)
-    options = motion_options(contacts, search.pose)
+    options = _options(search)
     kind = next((k for k in KINDS if options[k] and not search.spent(k)), None)
     if kind is None:
         return "equilibrium"
@@ -273,22 +287,52 @@ def _joint_trials(search: _Search) -> Iterator[Pose]:
         contacts = search.contact.contacts(p, 0.5 * box, along_only=True)
         if len(contacts):
             size = (box, box, box / search.settings.motion.radius_mm)
-            yield p.displaced(best_motion(reaction_rates(contacts, p), reaction_slack(contacts), size))
+            yield p.displaced(_joint_motion(search, contacts, size))
         box *= 0.5
 
 
-def motion_options(contacts: Contacts, pose: Pose) -> dict[Kind, list[Motion]]:
-    """Directions of each kind, per unit step, that the contacts promise an advance along delta for; best first."""
+def _joint_motion(search: _Search, contacts: Contacts, box: tuple[float, float, float]) -> Motion:
+    """The motion in a box that promises most, of those that the programme finds as it learns what the fibres do.
+
+    A stiff fibre pulls quite differently a little farther on. Energy curves upwards, so its tangent at any pose bounds
+    it from below: each pose that the programme comes to adds such a bound, until one proves as good as promised.
+    """
+    p, here = search.pose, search.contact.load(search.pose)
+    advance, spare = reaction_rates(contacts, p), reaction_slack(contacts)
+    rates, slack = reaction_rates(contacts, p, here), reaction_slack(contacts, here)
+    tried: list[tuple[float, Motion]] = []
+    for _ in range(MOST_TANGENTS):
+        motion = best_motion(rates, slack, box)
+        depth = float((spare + advance @ motion).min())
+        there = search.contact.load(p.displaced(motion)._replace(z=p.z + depth))
+        tried.append((depth - there.energy_mm + here.energy_mm, motion))
+        if tried[-1][0] >= float((slack + rates @ motion).min()) - LEAST_PROMISE:
+            break
+        x, y, turn = motion
+        bound = here.energy_mm - there.energy_mm + float(there.slope @ [x, y, turn, depth])
+        rates = np.vstack([rates, reaction_rates(contacts, p, there)])
+        slack = np.concatenate([slack, reaction_slack(contacts, there) + bound])
+    return max(tried)[1]
+
+
+def motion_options(contacts: Contacts, pose: Pose, load: Load = NO_LOAD) -> dict[Kind, list[Motion]]:
+    """Directions of each kind, per unit step, that contacts and fibres promise an advance for; best first."""
     if len(contacts) == 0:
         return {kind: [] for kind in KINDS}
-    rates = reaction_rates(contacts, pose)
-    return {"rotation": _rotations(contacts, rates, pose), "translation": _translations(contacts, rates)}
+    rates = reaction_rates(contacts, pose, load)
+    return {"rotation": _rotations(contacts, rates, pose, load), "translation": _translations(contacts, rates, load)}
 
 
-def _rotations(contacts: Contacts, rates: Float, pose: Pose) -> list[Motion]:
+def _rotations(contacts: Contacts, rates: Float, pose: Pose, load: Load) -> list[Motion]:
     centres = _centres(contacts, pose) - [pose.x, pose.y]
     motions = [(sense * cy, -sense * cx, sense) for cx, cy in centres for sense in (1.0, -1.0)]
+    if load.energy_mm > 0.0:
+        motions = [motion for motion in motions if _least(rates, motion) > _least(rates, (*motion[:2], 0.0))]
     return _promising(motions, rates)
+
+
+def _least(rates: Float, motion: Motion) -> float:
+    return float((rates @ np.asarray(motion)).min())
 
 
 def _centres(contacts: Contacts, pose: Pose) -> Float:
@@ -300,8 +344,9 @@ def _centres(contacts: Contacts, pose: Pose) -> Float:
     return np.array([[pose.x, pose.y], centroid, 0.5 * (one + other)])
 
 
-def _translations(contacts: Contacts, rates: Float) -> list[Motion]:
-    resultant = contacts.normals[:, :2].sum(axis=0)
+def _translations(contacts: Contacts, rates: Float, load: Load) -> list[Motion]:
+    # contacts push alike; so strongly that together they carry the push, the fibres pull as they do
+    resultant = contacts.normals[:, :2].sum(axis=0) - load.slope[:2] * (support(contacts).sum() / load.push)
     length = float(np.linalg.norm(resultant))
     motions: list[Motion] = []
     if length > 1e-9 * len(contacts):
@@ -311,6 +356,6 @@ def _translations(contacts: Contacts, rates: Float) -> list[Motion]:
 
 
 def _promising(motions: list[Motion], rates: Float) -> list[Motion]:
-    promise = [float((rates @ np.asarray(motion)).min()) for motion in motions]
+    promise = [_least(rates, motion) for motion in motions]
     order = sorted(range(len(motions)), key=lambda k: -promise[k])
     return [motions[k] for k in order if promise[k] > LEAST_PROMISE]

@@ -14,14 +14,17 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
-from pipeline.kinematics.cell import Cell, ProofSettings, failed_cell, measured_cell
-from pipeline.kinematics.contact import AttitudeContact, Bodies, Pose
-from pipeline.kinematics.descent import MotionSettings, drop
+from pipeline.kinematics.cell import NO_CERTIFICATE, Certificate
+from pipeline.kinematics.contact import Pose
+from pipeline.kinematics.solvers import ExactSolver
+from pipeline.kinematics.sweep import angles_rad
 from pipeline.kinematics.table import CurveFit, Float, Grid, PoseTable, RawTable, Status
 
 #: Huber's bound: 95 % as efficient as plain least squares where nothing jumps.
 HUBER_BOUND = 1.345
 HUBER_ROUNDS = 20
+#: A pose with one compartment this far open counts half as much (mm).
+LOOSE_MM = 1.0
 
 CURVES = (("lateral_mm", "mm"), ("anterior_mm", "mm"), ("internal_rotation_deg", "deg"))
 
@@ -60,7 +63,7 @@ def fit_curves(raw: RawTable, degrees: tuple[int, int]) -> tuple[CurveFit, ...]:
     """Robust least-squares fit of each found coordinate over the cells whose status is OK.
 
     Huber's weights (1964) in 20 rounds: where roughness or a lifted compartment lets single cells jump, the others keep
-    the curve.
+    the curve. Cells with one compartment open count less: there the surfaces hold the body loosely.
 
     Parameters
     ----------
@@ -82,7 +85,14 @@ def fit_curves(raw: RawTable, degrees: tuple[int, int]) -> tuple[CurveFit, ...]:
     design = _design(raw.grid, terms)[usable.ravel()]
     if np.linalg.matrix_rank(design) < len(terms):
         raise ValueError(f"the usable cells do not lie so that a polynomial of {len(terms)} terms is determined")
-    return tuple(_fit(name, unit, getattr(raw.poses, name)[usable], design, terms) for name, unit in CURVES)
+    held = _held(raw.poses)[usable]
+    return tuple(_fit((name, unit), getattr(raw.poses, name)[usable], design, held, terms) for name, unit in CURVES)
+
+
+def _held(poses: PoseTable) -> Float:
+    """(F, V) weight of each cell: 1 where both compartments touch, less where one is open and little holds the pose."""
+    open_mm = np.nan_to_num(np.fmax(poses.medial_gap_mm, poses.lateral_gap_mm))
+    return np.asarray(1.0 / np.sqrt(1.0 + (open_mm / LOOSE_MM) ** 2))
 
 
 def _terms(p: int, q: int) -> list[tuple[int, int]]:
@@ -96,18 +106,20 @@ def _design(grid: Grid, terms: Sequence[tuple[int, int]]) -> Float:
     return np.column_stack(columns)
 
 
-def _fit(name: str, unit: str, values: Float, design: Float, terms: Sequence[tuple[int, int]]) -> CurveFit:
-    weight = np.ones(len(values))
+def _fit(
+    curve: tuple[str, str], values: Float, design: Float, held: Float, terms: Sequence[tuple[int, int]]
+) -> CurveFit:
+    weight = held
     for _ in range(HUBER_ROUNDS):
         solution = np.linalg.lstsq(design * weight[:, None], values * weight, rcond=None)[0]
         residual = values - design @ solution
         usual = max(1.4826 * float(np.median(np.abs(residual))), 1e-9)
-        weight = 1.0 / np.sqrt(np.maximum(np.abs(residual) / (HUBER_BOUND * usual), 1.0))
+        weight = held / np.sqrt(np.maximum(np.abs(residual) / (HUBER_BOUND * usual), 1.0))
     coefficients = np.zeros((max(i for i, _ in terms) + 1, max(j for _, j in terms) + 1))
     for (i, j), value in zip(terms, solution, strict=True):
         coefficients[i, j] = value
     rms = float(np.sqrt(np.mean(residual**2)))
-    return CurveFit(name, unit, coefficients, rms, float(np.abs(residual).max()))
+    return CurveFit(*curve, coefficients, rms, float(np.abs(residual).max()))
 
 
 def evaluate(fit: CurveFit, grid: Grid) -> Float:
@@ -150,19 +162,24 @@ def _depth(poses: PoseTable, at: tuple[int, int]) -> float:
     return float(np.nanmin(column)) if np.isfinite(column).any() else 0.0
 
 
-def settle(bodies: Bodies, entry: Entry, motion: MotionSettings, proof: ProofSettings) -> Cell:
+class Settled(NamedTuple):
+    """An entry brought to contact along delta: its pose (None where it meets nothing), its certificate."""
+
+    entry: Entry
+    pose: Pose | None
+    certificate: Certificate
+
+
+def settle(solver: ExactSolver, entry: Entry) -> Settled:
     """One entry of the smoothed table: x, y and rotation as fitted, z by contact."""
     if not entry.status.usable:
-        return failed_cell(entry.status)
-    contact = AttitudeContact(bodies, np.radians(entry.flexion_deg), np.radians(entry.varus_deg))
-    pose = drop(contact, entry.start, motion)
-    if pose is None:
-        return failed_cell(Status.NO_CONTACT)
-    return measured_cell(contact, pose, entry.status, proof)
+        return Settled(entry, None, NO_CERTIFICATE)
+    attitude = solver.at(angles_rad((entry.flexion_deg, entry.varus_deg)))
+    pose = attitude.depth(entry.start)
+    return Settled(entry, pose, NO_CERTIFICATE if pose is None else attitude.certify(pose))
 
 
-def way_to_contact(bodies: Bodies, probe: Probe, motion: MotionSettings) -> float:
+def way_to_contact(solver: ExactSolver, probe: Probe) -> float:
     """Signed way along delta from a pose to first contact, mm: + a gap, - an intersection; NaN without contact."""
-    contact = AttitudeContact(bodies, np.radians(probe.flexion_deg), np.radians(probe.varus_deg))
-    pose = drop(contact, probe.pose, motion)
-    return float("nan") if pose is None else pose.z + 0.5 * motion.tolerance_mm - probe.pose.z
+    pose = solver.at(angles_rad((probe.flexion_deg, probe.varus_deg))).depth(probe.pose)
+    return float("nan") if pose is None else pose.z - probe.pose.z

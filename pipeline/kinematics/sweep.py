@@ -2,43 +2,39 @@
 
 The *spine* is the column of varus nearest to the scan's own, walked along flexion from the scan upwards and downwards.
 From each of its cells a *rib* walks out in varus to either side, as an examiner would open the knee at a held flexion.
-Every walk goes out to its end and back again: the way out is kept, because it is connected to the scan; the way back
-measures the hysteresis, and steps in only where the way out found nothing. Walks do not depend on one another (ribs
-only on the spine), so any number of workers gives the same bytes.
+The spine is walked out to its ends and back again: the way out is kept, because it is connected to the scan; the way
+back measures the hysteresis, and steps in only where the way out found nothing. Walks do not depend on one another
+(ribs only on the spine), so any number of workers gives the same bytes. Then jumps between neighbours are solved again
+from both sides (see :mod:`pipeline.kinematics.jumps`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.kinematics.cell import Cell, ProofSettings, failed_cell, measured_cell
-from pipeline.kinematics.contact import AttitudeContact, Bodies, Pose
-from pipeline.kinematics.incremental import IncrementalSettings, StablePose, solve_incremental
+from pipeline.kinematics.cell import Cell, Certificate, Proof, failed_cell
+from pipeline.kinematics.contact import Pose
+from pipeline.kinematics.incremental import StablePose
+from pipeline.kinematics.solvers import Margin, Solver
 from pipeline.kinematics.table import Float, Grid, PoseTable, RawTable, Status
 
-
-@dataclass(frozen=True)
-class SweepSettings:
-    """Solver and proof of a sweep."""
-
-    solver: IncrementalSettings = field(default_factory=IncrementalSettings)
-    proof: ProofSettings = field(default_factory=ProofSettings)
+Place = tuple[int, int]
 
 
 class Walk(NamedTuple):
     """A walk over neighbouring cells: their (row, column) and their (flexion, varus) in degrees, and the start.
 
-    ``centre`` is the middle of the bounds of every cell: the scan pose.
+    ``centre`` is the middle of the bounds of every cell: the scan pose. ``and_back``: the way is walked back as well.
     """
 
-    cells: tuple[tuple[int, int], ...]
+    cells: tuple[Place, ...]
     attitudes_deg: tuple[tuple[float, float], ...]
     start: Pose
     centre: Pose
+    and_back: bool
 
 
 class Release(NamedTuple):
@@ -50,12 +46,26 @@ class Release(NamedTuple):
     away: tuple[float, float, float]
 
 
-class Walked(NamedTuple):
-    """What a walk found, in the order of its cells: on the way out and on the way back."""
+class Found(NamedTuple):
+    """A solved cell: where the search was begun, and what it found."""
 
-    cells: tuple[tuple[int, int], ...]
-    out: tuple[Cell, ...]
-    back: tuple[Cell, ...]
+    start: Pose
+    stable: StablePose
+
+
+class Certified(NamedTuple):
+    """What is known of a stable pose by the features it rests on."""
+
+    certificate: Certificate
+    margin: Margin
+
+
+class Walked(NamedTuple):
+    """What a walk found, in the order of its cells: on the way out, and on the way back if it was walked."""
+
+    cells: tuple[Place, ...]
+    out: tuple[Found, ...]
+    back: tuple[Found, ...]
 
 
 def spine(grid: Grid, scan_flexion_deg: float, scan_varus_deg: float, scan: Pose) -> tuple[Walk, ...]:
@@ -71,7 +81,7 @@ def spine(grid: Grid, scan_flexion_deg: float, scan_varus_deg: float, scan: Pose
     """
     row, column = _nearest(grid.flexion_deg, scan_flexion_deg), _nearest(grid.varus_deg, scan_varus_deg)
     ways = [[(r, column) for r in range(row, grid.shape[0])], [(r, column) for r in range(row - 1, -1, -1)]]
-    walks = [_walk_over(grid, way, scan, scan) for way in ways if way]
+    walks = [_walk_over(grid, way, scan, scan)._replace(and_back=True) for way in ways if way]
     return tuple(sorted(walks, key=lambda walk: -len(walk.cells)))
 
 
@@ -80,7 +90,7 @@ def ribs(grid: Grid, spine_walked: Sequence[Walked], scan: Pose) -> tuple[Walk, 
 
     A rib whose own cell of the spine failed starts from the nearest row that did not; none can start where all failed.
     """
-    starts = {at: cell.pose for at, cell in _kept(spine_walked).items() if cell.status.usable}
+    starts = {at: one.stable.pose for at, one in kept(spine_walked).items() if one.stable.status.usable}
     if not starts:
         return ()
     column = next(iter(starts))[1]
@@ -97,75 +107,112 @@ def _nearest(values: Float, wanted: float) -> int:
     return int(np.argmin(np.abs(values - wanted)))
 
 
-def _walk_over(grid: Grid, cells: Sequence[tuple[int, int]], start: Pose, centre: Pose) -> Walk:
-    attitudes = [(float(grid.flexion_deg[row]), float(grid.varus_deg[column])) for row, column in cells]
-    return Walk(tuple(cells), tuple(attitudes), start, centre)
+def _walk_over(grid: Grid, cells: Sequence[Place], start: Pose, centre: Pose) -> Walk:
+    attitudes = [attitude_deg(grid, at) for at in cells]
+    return Walk(tuple(cells), tuple(attitudes), start, centre, and_back=False)
 
 
-def go(bodies: Bodies, walk: Walk, settings: SweepSettings) -> Walked:
+def attitude_deg(grid: Grid, at: Place) -> tuple[float, float]:
+    """Flexion and varus of a cell."""
+    return float(grid.flexion_deg[at[0]]), float(grid.varus_deg[at[1]])
+
+
+def angles_rad(attitude: tuple[float, float]) -> tuple[float, float]:
+    """(flexion, varus) in radians, from degrees."""
+    return float(np.radians(attitude[0])), float(np.radians(attitude[1]))
+
+
+def go(solver: Solver, walk: Walk) -> Walked:
     """Solve the cells of one walk outwards and back, each started from the last usable pose."""
-    contacts = [AttitudeContact(bodies, np.radians(f), np.radians(v)) for f, v in walk.attitudes_deg]
-    out, last = _pass(contacts, walk.start, walk.centre, settings)
-    back, _ = _pass(contacts[::-1], last, walk.centre, settings)
-    return Walked(walk.cells, out, back[::-1])
+    attitudes = [solver.at(angles_rad(one)) for one in walk.attitudes_deg]
+    start, out, back = walk.start, list[Found](), list[Found]()
+    for attitude in attitudes:
+        out.append(Found(start, attitude.solve(start, walk.centre)))
+        start = out[-1].stable.pose if out[-1].stable.status.usable else start
+    for attitude in reversed(attitudes) if walk.and_back else ():
+        back.append(Found(start, attitude.solve(start, walk.centre)))
+        start = back[-1].stable.pose if back[-1].stable.status.usable else start
+    return Walked(walk.cells, tuple(out), tuple(back[::-1]))
 
 
-def let_go(bodies: Bodies, release: Release, settings: SweepSettings) -> StablePose:
-    """Where a body comes to rest that was let go near the scan pose, pulled back far enough to be clear."""
-    contact = AttitudeContact(bodies, np.radians(release.flexion_deg), np.radians(release.varus_deg))
-    return solve_incremental(contact, release.scan.displaced(release.away), settings.solver, release.scan)
+def certified(solver: Solver, at: tuple[tuple[float, float], Pose]) -> Certified:
+    """Certificate and margin of a stable pose at (flexion, varus) in degrees."""
+    attitude = solver.at(angles_rad(at[0]))
+    return Certified(attitude.certify(at[1]), attitude.margin(at[1]))
 
 
-def _pass(
-    attitudes: Sequence[AttitudeContact], start: Pose, centre: Pose, settings: SweepSettings
-) -> tuple[tuple[Cell, ...], Pose]:
-    cells = []
-    for contact in attitudes:
-        solved = solve_incremental(contact, start, settings.solver, centre)
-        if solved.status is Status.OK:
-            start = solved.pose
-        cells.append(_cell(contact, solved, settings))
-    return tuple(cells), start
+def let_go(solver: Solver, release: Release) -> StablePose:
+    """Where a body comes to rest that was let go near the scan pose."""
+    attitude = solver.at(angles_rad((release.flexion_deg, release.varus_deg)))
+    return attitude.solve(release.scan.displaced(release.away), release.scan)
 
 
-def _cell(contact: AttitudeContact, solved: StablePose, settings: SweepSettings) -> Cell:
-    if solved.status is not Status.OK:
-        return failed_cell(solved.status, solved.motions)
-    return measured_cell(contact, solved.pose, solved.status, settings.proof, solved.motions)
-
-
-def assemble(grid: Grid, walked: Sequence[Walked]) -> RawTable:
-    """The raw table of a whole grid from its walks; cells that no walk reached are NOT_CONVERGED."""
-    kept = _kept(walked)
-    unreached = failed_cell(Status.NOT_CONVERGED)
-    cells = [[kept.get((row, column), unreached) for column in range(grid.shape[1])] for row in range(grid.shape[0])]
-    hysteresis_mm, hysteresis_deg = np.full(grid.shape, np.nan), np.full(grid.shape, np.nan)
+def kept(walked: Sequence[Walked]) -> dict[Place, Found]:
+    """What each cell keeps: the way out, or the way back where only that found a pose."""
+    found = {at: out for walk in walked for at, out in zip(walk.cells, walk.out, strict=True)}
     for walk in walked:
-        for at, out, back in zip(walk.cells, walk.out, walk.back, strict=True):
-            hysteresis_mm[at], hysteresis_deg[at] = _difference(out, back)
+        for at, back in zip(walk.cells, walk.back, strict=False):
+            if back.stable.status.usable and not found[at].stable.status.usable:
+                found[at] = back
+    return found
+
+
+class Hysteresis(NamedTuple):
+    """Way out against way back, (F, V): mm and deg; NaN where not both are usable."""
+
+    shift_mm: Float
+    rotation_deg: Float
+
+
+def hysteresis(grid: Grid, walked: Sequence[Walked]) -> Hysteresis:
+    """What the two passes of every walk that went both ways differ by."""
+    shift, rotation = np.full(grid.shape, np.nan), np.full(grid.shape, np.nan)
+    for walk in walked:
+        for at, out, back in zip(walk.cells, walk.out, walk.back, strict=False):
+            if out.stable.status.usable and back.stable.status.usable:
+                difference = np.subtract(out.stable.pose, back.stable.pose)
+                shift[at] = float(np.linalg.norm(difference[:3]))
+                rotation[at] = float(np.degrees(abs(difference[3])))
+    return Hysteresis(shift, rotation)
+
+
+class Evidence(NamedTuple):
+    """What is known of the usable cells: by the features they rest on, and by exact collision."""
+
+    certified: Mapping[Place, Certified]
+    proofs: Mapping[Place, Proof]
+
+
+def assemble(grid: Grid, found: Mapping[Place, Found], evidence: Evidence, passes: Hysteresis) -> RawTable:
+    """The raw table of a whole grid; cells that no walk reached are NOT_CONVERGED."""
+
+    def cell(at: Place) -> Cell:
+        if at not in found:
+            return failed_cell(Status.NOT_CONVERGED)
+        stable = found[at].stable
+        if not stable.status.usable:
+            return failed_cell(stable.status, stable.motions)
+        return Cell(stable.pose, stable.status, stable.motions, evidence.certified[at].certificate, evidence.proofs[at])
+
+    def margin(pick: Callable[[Margin], float]) -> Float:
+        out = np.full(grid.shape, np.nan)
+        for at, one in evidence.certified.items():
+            out[at] = pick(one.margin)
+        return out
+
+    cells = [[cell((row, column)) for column in range(grid.shape[1])] for row in range(grid.shape[0])]
     return RawTable(
         grid=grid,
         poses=pose_table(cells),
         iterations=np.array([[c.motions for c in row] for row in cells], dtype=np.int32),
-        gap_before_mm=np.array([[c.gap_before_mm for c in row] for row in cells]),
-        gap_after_mm=np.array([[c.gap_after_mm for c in row] for row in cells]),
-        hysteresis_mm=hysteresis_mm,
-        hysteresis_deg=hysteresis_deg,
+        gap_before_mm=np.array([[c.proof.gap_before_mm for c in row] for row in cells]),
+        gap_after_mm=np.array([[c.proof.gap_after_mm for c in row] for row in cells]),
+        hysteresis_mm=passes.shift_mm,
+        hysteresis_deg=passes.rotation_deg,
+        margin_lateral_mm=margin(lambda one: one.lateral_mm),
+        margin_anterior_mm=margin(lambda one: one.anterior_mm),
+        margin_rotation_deg=margin(lambda one: one.rotation_deg),
     )
-
-
-def _kept(walked: Sequence[Walked]) -> dict[tuple[int, int], Cell]:
-    return {
-        at: back if back.status.usable and not out.status.usable else out
-        for walk in walked
-        for at, out, back in zip(walk.cells, walk.out, walk.back, strict=True)
-    }
-
-
-def _difference(out: Cell, back: Cell) -> tuple[float, float]:
-    """Shift (mm) and rotation (deg) between two passes; NaN when not both are usable."""
-    difference = np.subtract(out.pose, back.pose)
-    return float(np.linalg.norm(difference[:3])), float(np.degrees(abs(difference[3])))
 
 
 def pose_table(cells: Sequence[Sequence[Cell]]) -> PoseTable:
@@ -180,8 +227,8 @@ def pose_table(cells: Sequence[Sequence[Cell]]) -> PoseTable:
         proximal_mm=of(lambda c: c.pose.z),
         internal_rotation_deg=np.degrees(of(lambda c: c.pose.theta)),
         status=np.array([[c.status for c in row] for row in cells], dtype=np.uint8),
-        equilibrium_residual=of(lambda c: c.residual),
-        medial_gap_mm=of(lambda c: c.medial_gap_mm),
-        lateral_gap_mm=of(lambda c: c.lateral_gap_mm),
-        contact_count=np.array([[c.contact_count for c in row] for row in cells], dtype=np.int32),
+        equilibrium_residual=of(lambda c: c.certificate.residual),
+        medial_gap_mm=of(lambda c: c.proof.medial_gap_mm),
+        lateral_gap_mm=of(lambda c: c.proof.lateral_gap_mm),
+        contact_count=np.array([[c.certificate.contact_count for c in row] for row in cells], dtype=np.int32),
     )

@@ -84,8 +84,11 @@ class RawTable:
         Proof on both sides: pulled back by ``gap_before_mm`` the bodies are clear, pushed on by ``gap_after_mm``
         they intersect (exact triangle test).
     hysteresis_mm, hysteresis_deg : (F, V) float64
-        Way out against way back (along flexion at neutral varus, along varus elsewhere): length of the difference of
-        (x, y, z), and of the rotation; NaN where not both are usable.
+        Way out against way back along flexion, known in the column nearest the scan's varus: length of the difference
+        of (x, y, z), and of the rotation; NaN elsewhere and where not both are usable.
+    margin_lateral_mm, margin_anterior_mm, margin_rotation_deg : (F, V) float64
+        How far each coordinate may be pushed, the others held, while the depth keeps falling (coarse); NaN where the
+        solver cannot tell.
     """
 
     grid: Grid
@@ -95,6 +98,9 @@ class RawTable:
     gap_after_mm: Float
     hysteresis_mm: Float
     hysteresis_deg: Float
+    margin_lateral_mm: Float
+    margin_anterior_mm: Float
+    margin_rotation_deg: Float
 
 
 @dataclass(frozen=True, eq=False)

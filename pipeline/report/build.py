@@ -21,7 +21,7 @@ from pipeline.report.settings import PictureSettings
 TEMPLATE = "report.html.j2"
 STYLE = "report.css"
 #: Packages whose version can change a number or a picture.
-PACKAGES = ("numpy", "scipy", "vtk", "pyvista", "python-fcl", "opencv-python-headless", "matplotlib")
+PACKAGES = ("numpy", "scipy", "vtk", "python-fcl", "opencv-python-headless", "matplotlib")
 ORIGIN_WORDS = {
     "labelled": "labelled in the scan",
     "synthesised": "MADE BY THE PROGRAM, not seen in the scan",

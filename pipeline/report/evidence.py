@@ -12,8 +12,9 @@ from pipeline.engine.stage import Findings
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.geometry.volume import LabelVolume
 from pipeline.kinematics.joint_coordinates import JointCoordinates, moved_from_scan
+from pipeline.kinematics.neutral import NeutralCurve
 from pipeline.kinematics.table import Grid, RawTable, SmoothTable, Status
-from pipeline.records import Anatomy, CaseFacts, MeshQuality, ScanReturn, SurfaceOrigin
+from pipeline.records import Anatomy, CaseFacts, MeshQuality, ScanReturn, SurfaceOrigin, SweepFacts
 
 Float = NDArray[np.float64]
 
@@ -50,6 +51,8 @@ class Evidence:
     origins: tuple[SurfaceOrigin, ...]
     raw: RawTable
     scan_returns: tuple[ScanReturn, ...]
+    sweep: SweepFacts
+    neutral: NeutralCurve
     smooth: SmoothTable
     findings: Mapping[str, Findings]
 

@@ -99,19 +99,22 @@ def body_colors(evidence: Evidence, body: str) -> NDArray[np.uint8]:
     made = any(o.origin == "synthesised" for o in evidence.origins if o.body == body)
     if not names:
         return np.tile(np.array(BONE if body == "reference" else MOVING, dtype=np.uint8), (len(mesh.points), 1))
-    distance = np.stack([_vertex_distance(mesh.points, evidence.meshes[name].points) for name in names])
+    vertices = [evidence.meshes[name].points for name in names]
+    structure = np.repeat(np.arange(len(names)), [len(points) for points in vertices])
+    distance, nearest = _nearest_vertex(mesh.points, np.concatenate(vertices))
     palette = np.array([structure_color(name) for name in names], dtype=np.uint8)
-    colors: NDArray[np.uint8] = palette[np.argmin(distance, axis=0)]
+    colors: NDArray[np.uint8] = palette[structure[nearest]]
     if made:
-        colors[distance.min(axis=0) > MADE_BEYOND_MM] = MADE
+        colors[distance > MADE_BEYOND_MM] = MADE
     return colors
 
 
-def _vertex_distance(points: Float, vertices: Float, reach_mm: float = np.inf) -> Float:
-    """(N,) distance to the nearest vertex; infinite beyond ``reach_mm``."""
-    from scipy.spatial import cKDTree  # noqa: PLC0415  - a cached run must not load it
+def _nearest_vertex(points: Float, vertices: Float, reach_mm: float = np.inf) -> tuple[Float, NDArray[np.intp]]:
+    """(N,) distance to the nearest vertex, and its number; infinite and without meaning beyond ``reach_mm``."""
+    from scipy.spatial import KDTree  # noqa: PLC0415  - a cached run must not load it
 
-    return np.asarray(cKDTree(vertices).query(points, distance_upper_bound=reach_mm)[0], dtype=np.float64)
+    distance, nearest = KDTree(vertices).query(points, distance_upper_bound=reach_mm)
+    return np.asarray(distance), np.asarray(nearest)
 
 
 def _pose_legend(evidence: Evidence) -> list[tuple[str, Color]]:
@@ -131,7 +134,8 @@ def contact_picture(evidence: Evidence, settings: PictureSettings) -> Image:
     """
     cells = _usable_cells(evidence, settings)
     seen = _from_above(evidence)
-    panels = [_contact_panel(evidence, settings, cell, seen) for cell in cells]
+    colors = _contact_colors(evidence, settings, cells)
+    panels = [_contact_panel(evidence, settings, cell, seen, colors.get(cell)) for cell in cells]
     bar = pictures.color_bar(scale(np.linspace(0.0, 1.0, 256)), _bar_labels(settings), panels[0].shape[1] * 2)
     legend = [(f"farther than {settings.contact_range_mm:g} mm", BONE), ("overlap beyond 0.145 mm", OVERLAP)]
     title = "Moving body seen from proximal, coloured by its distance to the other body; dark is contact"
@@ -152,12 +156,23 @@ def _bar_labels(settings: PictureSettings) -> list[str]:
     return [f"{value:g} mm" for value in np.linspace(0.0, settings.contact_range_mm, 5)]
 
 
-def _contact_panel(evidence: Evidence, settings: PictureSettings, cell: Cell, seen: View) -> Image:
+def _contact_colors(
+    evidence: Evidence, settings: PictureSettings, cells: Iterable[Cell]
+) -> dict[Cell, NDArray[np.uint8]]:
+    """Of the moving body's vertices in each cell that has a pose; all at once, since the search tree takes long."""
+    usable = [cell for cell in cells if cell.status.usable]
+    placed = [transformed(evidence.moving, cell_motion(evidence, cell)).points for cell in usable]
+    distance = near_distances(np.concatenate(placed), evidence.reference, settings.contact_range_mm)
+    colors = distance_colors(distance, settings)
+    return dict(zip(usable, np.split(colors, len(usable)), strict=True))
+
+
+def _contact_panel(
+    evidence: Evidence, settings: PictureSettings, cell: Cell, seen: View, colors: NDArray[np.uint8] | None
+) -> Image:
     size = round(settings.panel_px * CONTACT_SHARE)
-    if not cell.status.usable:
+    if colors is None:
         return _no_pose(cell, size)
-    points = transformed(evidence.moving, cell_motion(evidence, cell)).points
-    colors = distance_colors(near_distances(points, evidence.reference, settings.contact_range_mm), settings)
     (panel,) = snapshots([Surface(evidence.moving, colors, plain=True)], [seen], (size, size))
     title_panel(panel, _title(cell))
     mark_edges(panel, seen)
@@ -168,9 +183,10 @@ def _contact_panel(evidence: Evidence, settings: PictureSettings, cell: Cell, se
 def near_distances(points: Float, mesh: TriangleMesh, reach_mm: float) -> Float:
     """(N,) signed distance of points to a surface; infinite where surely beyond ``reach_mm``."""
     edge = mesh.points[mesh.triangles[:, 0]] - mesh.points[mesh.triangles[:, 1]]
-    # No point of a surface is farther than an edge from a vertex.
-    slack = float(np.linalg.norm(edge, axis=1).max())
-    near = np.isfinite(_vertex_distance(points, mesh.points, reach_mm + slack))
+    longest = float(np.linalg.norm(edge, axis=1).max())
+    # The way to a surface is at right angles to it, and there a vertex is no farther than the longest edge / sqrt(3).
+    far = np.hypot(reach_mm, longest / np.sqrt(3.0))
+    near = np.isfinite(_nearest_vertex(points, mesh.points, far)[0])
     out = np.full(len(points), np.inf)
     out[near] = distances_mm(points[near], mesh)
     return out

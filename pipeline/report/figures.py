@@ -43,6 +43,31 @@ class Drawn:
     problem: str = ""
 
 
+# functions of the module, not lambdas: a figure is sent to a worker process
+def _slices(evidence: Evidence, settings: PictureSettings, _: Limits) -> bytes:
+    return png(slices_picture(evidence, settings))
+
+
+def _bones(evidence: Evidence, settings: PictureSettings, _: Limits) -> bytes:
+    return png(bones_picture(evidence, settings))
+
+
+def _poses(evidence: Evidence, settings: PictureSettings, _: Limits) -> bytes:
+    return png(poses_picture(evidence, settings))
+
+
+def _contact(evidence: Evidence, settings: PictureSettings, _: Limits) -> bytes:
+    return png(contact_picture(evidence, settings))
+
+
+def _curves(evidence: Evidence, _: PictureSettings, __: Limits) -> bytes:
+    return curves_png(evidence)
+
+
+def _checks(evidence: Evidence, _: PictureSettings, limits: Limits) -> bytes:
+    return checks_png(evidence, limits)
+
+
 SLICES = Figure(
     "slices",
     "Labels and surfaces in three planes",
@@ -52,7 +77,7 @@ SLICES = Figure(
         "An outline leaves its area, a structure is missing or sits on the wrong bone, left and right are exchanged.",
         "Correct the segmentation, or the label names in case.yaml, and run the case again.",
     ),
-    lambda evidence, settings, _: png(slices_picture(evidence, settings)),
+    _slices,
 )
 BONES = Figure(
     "bones",
@@ -63,7 +88,7 @@ BONES = Figure(
         "An axis leaves its bone or is clearly tilted; a landmark lies on the wrong side or off the bone.",
         "Place the landmark in 3D Slicer, save landmarks.mrk.json beside the label map, and run the case again.",
     ),
-    lambda evidence, settings, _: png(bones_picture(evidence, settings)),
+    _bones,
 )
 POSES = Figure(
     "poses",
@@ -74,7 +99,7 @@ POSES = Figure(
         "A bone floats, sinks in, slides off or turns suddenly.",
         "Look at the curves at that flexion; check axes and contact surfaces before the table is used there.",
     ),
-    lambda evidence, settings, _: png(poses_picture(evidence, settings)),
+    _poses,
 )
 CONTACT = Figure(
     "contact",
@@ -85,7 +110,7 @@ CONTACT = Figure(
         "A dark spot on the rim only, on one side only, or orange areas (overlap).",
         "Check cartilage and menisci in the label map; a one-sided contact may mean that the varus does not fit.",
     ),
-    lambda evidence, settings, _: png(contact_picture(evidence, settings)),
+    _contact,
 )
 CURVES = Figure(
     "curves",
@@ -96,7 +121,7 @@ CURVES = Figure(
         "Dots jump away from the line, lines cross wildly, crosses mark attitudes without a pose.",
         "Jumps come from rough surfaces: look at the contact picture there. Steep rotation: check the flexion axis.",
     ),
-    lambda evidence, _settings, _limits: curves_png(evidence),
+    _curves,
 )
 CHECKS = Figure(
     "checks",
@@ -107,7 +132,7 @@ CHECKS = Figure(
         "Contact error beyond the dashed lines, one side wide open at every varus, hysteresis above 1 mm.",
         "Use a finer grid or a higher degree of smoothing where contact is lost; check the axes where a side is open.",
     ),
-    lambda evidence, _, limits: checks_png(evidence, limits),
+    _checks,
 )
 
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.mesh import TriangleMesh, edge_defects
 from pipeline.kinematics.interpolation import usable_entries
-from pipeline.kinematics.table import PoseTable, SmoothTable, Status
-from pipeline.records import Metric
-from pipeline.report.evidence import CURVES, STATUS_WORDS, Evidence, plain
+from pipeline.kinematics.table import RawTable, SmoothTable, Status
+from pipeline.records import CrossCheck, Metric, SweepFacts
+from pipeline.report.evidence import STATUS_WORDS, Evidence, plain
 from pipeline.report.settings import Limits
 
 Float = NDArray[np.float64]
@@ -120,47 +120,63 @@ def _sweep_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
         yield from _worst(
             Measured("raw_contact_gap", "Contact of raw poses proven within", 0.0, "mm", meaning), gaps, limit
         )
-        yield from _repeatability_metrics(evidence, limits)
+        yield from _repeatability_metrics(evidence)
 
 
-def _repeatability_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
+def _repeatability_metrics(evidence: Evidence) -> Iterator[Metric]:
     raw = evidence.raw
     meaning = (
-        "Largest difference of the way out and the way back (bending at neutral varus, opening elsewhere); "
-        "below 1 mm and 2 deg in the literature."
+        "Largest difference of bending and straightening at the scan's varus; below 1 mm and 2 deg in the literature."
     )
     for values, unit in ((raw.hysteresis_mm, "mm"), (raw.hysteresis_deg, "deg")):
         if np.isfinite(values).any():
             title = f"Hysteresis ({'shift' if unit == 'mm' else 'rotation'})"
             yield info(Measured(f"hysteresis_{unit}", title, float(np.nanmax(values)), unit, meaning))
-    if raw.grid.shape == evidence.smooth.grid.shape:
-        yield from _jump_metrics(evidence, limits)
+    yield from _margin_metrics(raw)
+    yield from _jump_metrics(evidence.sweep)
+    yield from _cross_check_metrics(evidence.sweep.cross_check)
 
 
-def _jump_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
-    shift, turn = jumps(evidence.raw.poses, evidence.smooth.poses)
-    count = int(((shift > limits.jump_mm) | (turn > limits.jump_deg)).sum())
+def _margin_metrics(raw: RawTable) -> Iterator[Metric]:
     meaning = (
-        f"Neighbouring raw poses that differ by {limits.jump_mm:g} mm or {limits.jump_deg:g} deg more than the fit."
+        "How far a pose may be pushed straight, the rest held, before its depth stops falling; median, coarse "
+        "(steps of 1 mm and 2 deg up to 5 mm and 10 deg)."
     )
-    yield info(Measured("jumps", "Jumps between neighbouring poses", float(count), "jumps", meaning))
-    meaning = "Largest step between neighbouring raw poses beyond that of the fit; rough surfaces make jumps."
-    for name, title, values, unit in (("mm", "shift", shift, "mm"), ("deg", "rotation", turn, "deg")):
+    for name, title, values, unit in (
+        ("lateral", "sideways", raw.margin_lateral_mm, "mm"),
+        ("anterior", "forwards or backwards", raw.margin_anterior_mm, "mm"),
+        ("rotation", "rotation", raw.margin_rotation_deg, "deg"),
+    ):
         if np.isfinite(values).any():
-            yield info(Measured(f"jump_{name}", f"Largest jump ({title})", float(np.nanmax(values)), unit, meaning))
+            measured = Measured(
+                f"margin_{name}", f"Stability margin ({title})", float(np.nanmedian(values)), unit, meaning
+            )
+            yield info(measured)
 
 
-def jumps(raw: PoseTable, fitted: PoseTable) -> tuple[Float, Float]:
-    """Steps of raw minus fitted between neighbours along flexion and varus, shift (K,) mm and rotation (K,) deg.
+def _jump_metrics(facts: SweepFacts) -> Iterator[Metric]:
+    meaning = "Neighbouring raw poses that differ far more than is usual along their line; rough surfaces make jumps."
+    for name, title, jumped in (
+        ("before", "as first found", facts.jumps_before),
+        ("after", "solved again from both sides", facts.jumps_after),
+    ):
+        yield info(Measured(f"jumps_{name}", f"Jumps, {title}", float(jumped.count), "jumps", meaning))
+    meaning = "Largest difference between two neighbouring raw poses."
+    yield info(Measured("jump_mm", "Largest step (shift)", facts.jumps_after.largest_mm, "mm", meaning))
+    yield info(Measured("jump_deg", "Largest step (rotation)", facts.jumps_after.largest_deg, "deg", meaning))
 
-    Taking the fit off first leaves out the motion itself, so the measure does not depend on the step of the grid. NaN
-    beside an unusable entry.
-    """
-    both = usable_entries(raw) & usable_entries(fitted)
-    names = [name for name, _, _ in CURVES]
-    rest = np.stack([np.where(both, getattr(raw, name) - getattr(fitted, name), np.nan) for name in names], axis=-1)
-    steps = np.concatenate([np.diff(rest, axis=0).reshape(-1, 4), np.diff(rest, axis=1).reshape(-1, 4)])
-    return np.linalg.norm(steps[:, :3], axis=1), np.abs(steps[:, 3])
+
+def _cross_check_metrics(check: CrossCheck) -> Iterator[Metric]:
+    if not check.cells:
+        return
+    meaning = f"Share of {check.cells} attitudes where the other solver, from the same start, finds the same pose."
+    share = 100.0 * check.agreeing / check.cells
+    yield info(Measured("cross_check_agreeing", "Solvers agree", share, "%", meaning))
+    meaning = "Largest difference of the two solvers; where a maximum is not unique they may choose differently."
+    yield info(Measured("cross_check_mm", "Solvers differ (shift)", check.shift_mm, "mm", meaning))
+    yield info(Measured("cross_check_deg", "Solvers differ (rotation)", check.rotation_deg, "deg", meaning))
+    meaning = f"How much less deep the table's pose is than the other solver's, in {check.shallower} attitudes."
+    yield info(Measured("cross_check_shallower", "Table shallower by", check.shallower_mm, "mm", meaning))
 
 
 def _scan_pose_metrics(evidence: Evidence) -> Iterator[Metric]:

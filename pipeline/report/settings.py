@@ -25,13 +25,6 @@ class Limits(StrictParams):
     max_raw_contact_error_mm: float = Field(
         0.02, gt=0, le=1, description="largest distance from contact proven for an entry of the sweep, mm"
     )
-    jump_mm: float = Field(
-        0.5,
-        gt=0,
-        le=10,
-        description="a step between neighbouring raw poses, beyond that of the fit, counted as jump, mm",
-    )
-    jump_deg: float = Field(1.0, gt=0, le=45, description="the same for the rotation, degrees")
 
 
 class PictureSettings(StrictParams):

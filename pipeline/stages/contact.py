@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from pipeline.adapters.mask_surface import SurfaceResult, SurfaceSettings, mask_to_mesh
+from pipeline.adapters.mask_surface import SurfaceResult, SurfaceSettings, SurfaceTask, meshes_of
 from pipeline.artifacts import ANATOMY, CASE_FACTS, LABELS, MESHES, MOVING_BODY, REFERENCE_BODY, SURFACE_ORIGINS
 from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage, StrictParams
 from pipeline.errors import CaseRejected
 from pipeline.geometry.mesh import TriangleMesh, merged
 from pipeline.geometry.volume import LabelVolume
-from pipeline.geometry.voxel_mask import seen_as_right
+from pipeline.geometry.voxel_mask import part_with, seen_as_right, voxels_of
 from pipeline.records import Anatomy, CaseFacts, SurfaceOrigin
-
-Mask = NDArray[np.bool_]
 
 
 class Params(StrictParams):
@@ -65,26 +62,23 @@ def _of_labels(reads: Inputs, params: Params, out: Outputs) -> Findings:
     given, facts, anatomy = reads[LABELS], reads[CASE_FACTS], reads[ANATOMY]
     if given is None:
         raise ValueError("a case of labels has no label volume")
-    labels = seen_as_right(given, facts.side)
-    near = _near_joint(labels, anatomy, params.reach_mm)
-    masks = [_mask(labels, facts, names) & near for names in (params.reference, params.moving)]
+    near = _near_joint(seen_as_right(given, facts.side), anatomy, params.reach_mm)
+    reference, moving = _values(facts, params.reference), _values(facts, params.moving)
     settings = SurfaceSettings(triangles=params.triangles)
-    findings: list[Finding] = []
-    for artifact, mask, other, name in (
-        (REFERENCE_BODY, masks[0], masks[1], "reference"),
-        (MOVING_BODY, masks[1], masks[0], "moving"),
-    ):
-        result = _surface(mask, other, labels, settings, name)
-        out[artifact] = result.mesh
-        findings.append(_described(name, result))
-    return tuple(findings)
+    results = meshes_of([_task(near, reference, moving, settings), _task(near, moving, reference, settings)], out.jobs)
+    return tuple(_kept(body, result, out) for body, result in zip(("reference", "moving"), results, strict=True))
 
 
-def _surface(mask: Mask, other: Mask, labels: LabelVolume, settings: SurfaceSettings, name: str) -> SurfaceResult:
-    try:
-        return mask_to_mesh(mask, labels.lps_from_index, settings, keep_out=other)
-    except ValueError as error:
-        raise _no_surface(name, error) from error
+def _task(near: LabelVolume, own: list[int], other: list[int], settings: SurfaceSettings) -> SurfaceTask:
+    part = part_with(near, own)
+    return SurfaceTask(voxels_of(part.values, own), part.lps_from_index, settings, voxels_of(part.values, other))
+
+
+def _kept(body: str, result: SurfaceResult | ValueError, out: Outputs) -> Finding:
+    if isinstance(result, ValueError):
+        raise _no_surface(body, result) from result
+    out[REFERENCE_BODY if body == "reference" else MOVING_BODY] = result.mesh
+    return _described(body, result)
 
 
 def _described(name: str, result: SurfaceResult) -> Finding:
@@ -97,30 +91,20 @@ def _described(name: str, result: SurfaceResult) -> Finding:
     )
 
 
-def _mask(labels: LabelVolume, facts: CaseFacts, names: list[str]) -> Mask:
-    values = [facts.structures[name] for name in names if name in facts.structures]
-    mask: Mask = np.isin(labels.values, values)
-    return mask
+def _values(facts: CaseFacts, names: list[str]) -> list[int]:
+    return [facts.structures[name] for name in names if name in facts.structures]
 
 
-def _near_joint(labels: LabelVolume, anatomy: Anatomy, reach_mm: float) -> Mask:
-    """Voxels within the reach of the moving frame's origin."""
-    origin = np.asarray(anatomy.scan_from_moving)[:3, 3]
-    matrix = labels.lps_from_index
-    offset = matrix[:3, 3] - origin
-    axes = [np.arange(n, dtype=np.float64) for n in labels.values.shape]
-    squared = sum(
-        (
-            matrix[r, 0] * axes[0][:, None, None]
-            + matrix[r, 1] * axes[1][None, :, None]
-            + matrix[r, 2] * axes[2]
-            + offset[r]
-        )
-        ** 2
-        for r in range(3)
-    )
-    near: Mask = squared < reach_mm**2
-    return near
+def _near_joint(labels: LabelVolume, anatomy: Anatomy, reach_mm: float) -> LabelVolume:
+    """The labels within the reach of the moving frame's origin; slice by slice, which takes little memory."""
+    matrix, values = labels.lps_from_index, np.zeros_like(labels.values)
+    offset = matrix[:3, 3] - np.asarray(anatomy.scan_from_moving)[:3, 3]
+    i, j, k = (np.arange(n, dtype=np.float64) for n in values.shape)
+    planes = [row[0] * i[:, None] + row[1] * j for row in matrix[:3]]
+    for at in range(len(k)):
+        squared = sum((planes[r] + matrix[r, 2] * k[at] + offset[r]) ** 2 for r in range(3))
+        values[:, :, at] = np.where(squared < reach_mm**2, labels.values[:, :, at], 0)
+    return LabelVolume(values, matrix)
 
 
 def _origins(params: Params, present: list[str]) -> tuple[SurfaceOrigin, ...]:

@@ -12,11 +12,12 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, StringConstraints
 
-from pipeline.artifacts import CASE_FACTS, GIVEN_MESHES, LABELS
+from pipeline.artifacts import CASE_FACTS, GIVEN_MESHES, LABELS, LIGAMENTS
 from pipeline.engine.artifacts import SOURCE, SourceFolder
 from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage, StrictParams
 from pipeline.errors import CaseRejected
 from pipeline.files.case_files import CaseFiles, choose_files, read_file
+from pipeline.files.ligaments_file import read_ligaments
 from pipeline.files.markups import read_markups
 from pipeline.files.meshes import read_mesh
 from pipeline.files.volumes import LabelMap, read_label_map
@@ -33,7 +34,7 @@ from pipeline.label_review import (
     review_unused,
 )
 from pipeline.label_scheme import MARGIN_VOXELS, number_structures, renumbered, structure_values
-from pipeline.records import CaseFacts, Side
+from pipeline.records import CaseFacts, LigamentFibre, Side
 
 StructureName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
 LabelValue = Annotated[int, Field(ge=1, le=65_535)]
@@ -66,12 +67,13 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     Raises
     ------
     CaseRejected
-        E-SIDE-01, E-IO-*, E-GEO-*, E-LBL-*, E-LMK-*; see ``docs/messages.md``.
+        E-SIDE-01, E-IO-*, E-GEO-*, E-LBL-*, E-LMK-*, E-LIG-*; see ``docs/messages.md``.
     """
     source = reads[SOURCE]
     side = _declared_side(params)
     files = choose_files(source.files)
     facts = _common_facts(source, files, params, side)
+    out[LIGAMENTS] = _ligaments(source, files.ligaments)
     if files.label_map is None:
         meshes, findings = _given_meshes(source, files.meshes, params, out)
         out[CASE_FACTS], out[LABELS], out[GIVEN_MESHES] = _facts_of_meshes(facts, meshes), None, meshes
@@ -80,7 +82,7 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     return _take_labels(label_map, files.label_map, params, facts, out)
 
 
-STAGE = Stage(10, "intake", (SOURCE,), (CASE_FACTS, LABELS, GIVEN_MESHES), Params, run)
+STAGE = Stage(10, "intake", (SOURCE,), (CASE_FACTS, LABELS, GIVEN_MESHES, LIGAMENTS), Params, run)
 
 
 def _declared_side(params: Params) -> Side:
@@ -109,6 +111,10 @@ def _common_facts(source: SourceFolder, files: CaseFiles, params: Params, side: 
         clipped_mm2={},
         landmarks={} if landmarks is None else read_markups(read_file(source, landmarks), landmarks),
     )
+
+
+def _ligaments(source: SourceFolder, file: str | None) -> tuple[LigamentFibre, ...]:
+    return () if file is None else read_ligaments(read_file(source, file), file)
 
 
 def _given_meshes(

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import count
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field
 
-from pipeline.adapters.mask_surface import SurfaceResult, SurfaceSettings, mask_to_mesh
+from pipeline.adapters.mask_surface import SurfaceResult, SurfaceSettings, SurfaceTask, meshes_of
 from pipeline.artifacts import CASE_FACTS, GIVEN_MESHES, LABELS, MESH_QUALITY, MESHES
 from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage, StrictParams
 from pipeline.errors import CaseRejected
 from pipeline.geometry.mesh import TriangleMesh, check_arrays, check_closed, components, flipped, volume_mm3
 from pipeline.geometry.volume import LabelVolume
-from pipeline.geometry.voxel_mask import seen_as_right
+from pipeline.geometry.voxel_mask import part_with, seen_as_right
 from pipeline.records import MeshQuality
 
 TriangleCount = Annotated[int, Field(ge=500, le=2_000_000)]
@@ -71,12 +72,11 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     facts, labels = reads[CASE_FACTS], reads[LABELS]
     if labels is None:
         meshed = {name: _checked(name, mesh) for name, mesh in sorted(reads[GIVEN_MESHES].items())}
+        out.progress(len(meshed), len(meshed))
     else:
-        volume, meshed = seen_as_right(labels, facts.side), {}
-        for name, value in sorted(facts.structures.items()):
-            out.progress(len(meshed), len(facts.structures))
-            meshed[name] = _meshed(name, volume, value, params)
-    out.progress(len(meshed), len(meshed))
+        volume = seen_as_right(labels, facts.side)
+        results = _results(volume, facts.structures, params, out)
+        meshed = {name: _meshed(name, results[name], volume, params) for name in sorted(results)}
     out[MESHES] = {name: one.mesh for name, one in meshed.items() if one.mesh is not None}
     out[MESH_QUALITY] = tuple(one.quality for one in meshed.values() if one.quality is not None)
     return tuple(finding for one in meshed.values() for finding in one.findings)
@@ -101,14 +101,31 @@ def _checked(name: str, mesh: TriangleMesh) -> _Meshed:
     return _Meshed(outward, quality, (note,) if inverted else ())
 
 
-def _meshed(name: str, volume: LabelVolume, value: int, params: Params) -> _Meshed:
-    mask, others = volume.values == value, (volume.values != 0) & (volume.values != value)
-    try:
-        result = mask_to_mesh(mask, volume.lps_from_index, params.surface_settings(name), others)
-        if name in params.required and result.pieces > 1:
-            raise ValueError(f"it consists of {result.pieces} separate pieces")
-    except ValueError as error:
-        return _left_out(name, error, params)
+def _results(
+    volume: LabelVolume, structures: Mapping[str, int], params: Params, out: Outputs
+) -> dict[str, SurfaceResult | ValueError]:
+    """The surface of each structure, or why it has none."""
+    tasks = {name: _task(volume, value, params.surface_settings(name)) for name, value in structures.items()}
+    largest_first = sorted(tasks, key=lambda name: (-tasks[name].mask.size, name))
+    finished = count(1)
+    out.progress(0, len(tasks))
+    found = meshes_of(
+        [tasks[name] for name in largest_first], out.jobs, lambda _: out.progress(next(finished), len(tasks))
+    )
+    return dict(zip(largest_first, found, strict=True))
+
+
+def _task(volume: LabelVolume, value: int, settings: SurfaceSettings) -> SurfaceTask:
+    part = part_with(volume, [value])
+    mask = part.values == value
+    return SurfaceTask(mask, part.lps_from_index, settings, keep_out=(part.values != 0) & ~mask)
+
+
+def _meshed(name: str, result: SurfaceResult | ValueError, volume: LabelVolume, params: Params) -> _Meshed:
+    if isinstance(result, ValueError):
+        return _left_out(name, result, params)
+    if name in params.required and result.pieces > 1:
+        return _left_out(name, ValueError(f"it consists of {result.pieces} separate pieces"), params)
     return _Meshed(result.mesh, _quality(name, result), tuple(_findings(name, result, volume, params)))
 
 

@@ -15,6 +15,7 @@ from pipeline.artifacts import (
     CASE_FACTS,
     MESHES,
     MOVING_BODY,
+    NEUTRAL_CURVE,
     PACKAGE,
     RAW_TABLE,
     REFERENCE_BODY,
@@ -39,7 +40,7 @@ _SETTINGS = {name: settings_of(name) for name in _STAGES}
 _FINDINGS = {name: findings_of(name) for name in _STAGES}
 
 #: Packages whose numbers or files are in the deliverable.
-_PACKAGES = ("h5py", "meshio", "numpy", "pyvista", "python-fcl", "scipy", "trimesh", "vtk")
+_PACKAGES = ("h5py", "meshio", "numpy", "python-fcl", "scipy", "trimesh", "vtk")
 
 _NOTICE = "research use, not for diagnosis"
 
@@ -108,6 +109,7 @@ def _content(reads: Inputs) -> LutFileContent:
         software=f"ct2lut {__version__}",
         smooth=reads[SMOOTH_TABLE],
         raw=reads[RAW_TABLE],
+        neutral=reads[NEUTRAL_CURVE],
         scan_from_reference=np.array(anatomy.scan_from_reference),
         scan_from_moving=np.array(anatomy.scan_from_moving),
         delta=np.array(anatomy.delta),
@@ -172,6 +174,7 @@ STAGE = Stage(
         MOVING_BODY,
         SURFACE_ORIGINS,
         RAW_TABLE,
+        NEUTRAL_CURVE,
         SMOOTH_TABLE,
         VERDICT,
         REPORT,

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+from itertools import count
+
 from pydantic import Field
 
+from pipeline.adapters.rendering import require_renderer
+from pipeline.adapters.workers import map_in_order
 from pipeline.artifacts import (
     ANATOMY,
     CASE_FACTS,
@@ -11,15 +16,18 @@ from pipeline.artifacts import (
     MESH_QUALITY,
     MESHES,
     MOVING_BODY,
+    NEUTRAL_CURVE,
     RAW_TABLE,
     REFERENCE_BODY,
     REPORT,
     SCAN_RETURNS,
     SMOOTH_TABLE,
     SURFACE_ORIGINS,
+    SWEEP_FACTS,
     VERDICT,
 )
 from pipeline.engine.stage import Findings, Inputs, Outputs, Stage, StrictParams, findings_of
+from pipeline.errors import EnvironmentFault
 from pipeline.report.build import STYLE, TEMPLATE, Page, report_files
 from pipeline.report.evidence import Evidence
 from pipeline.report.figures import Drawn, drawn, expected_figures
@@ -28,6 +36,9 @@ from pipeline.report.settings import Limits, PictureSettings
 from pipeline.report.verdict import judge, metric_findings, picture_findings
 
 FINDINGS = {name: findings_of(name) for name in ("intake", "mesh", "anatomy", "contact", "sweep", "smooth")}
+
+#: The longest first, and the charts side by side: a worker that has drawn the one has loaded what draws the other.
+DRAWING_ORDER = ("poses", "curves", "checks", "slices", "contact", "bones")
 
 
 class Params(StrictParams):
@@ -63,18 +74,26 @@ def gather(reads: Inputs) -> Evidence:
         origins=reads[SURFACE_ORIGINS],
         raw=reads[RAW_TABLE],
         scan_returns=reads[SCAN_RETURNS],
+        sweep=reads[SWEEP_FACTS],
+        neutral=reads[NEUTRAL_CURVE],
         smooth=reads[SMOOTH_TABLE],
         findings={name: reads[artifact] for name, artifact in FINDINGS.items()},
     )
 
 
 def _draw(evidence: Evidence, params: Params, out: Outputs) -> list[Drawn]:
-    figures, pictures = expected_figures(evidence), []
-    for done, figure in enumerate(figures):
-        out.progress(done, len(figures))
-        pictures.append(drawn(figure, evidence, params.pictures, params.limits))
-    out.progress(len(figures), len(figures))
-    return pictures
+    figures, finished = expected_figures(evidence), count(1)
+    work = partial(drawn, evidence=evidence, settings=params.pictures, limits=params.limits)
+    order = sorted(figures, key=lambda figure: DRAWING_ORDER.index(figure.name))
+    out.progress(0, len(figures))
+    try:
+        found = map_in_order(work, order, out.jobs, lambda _: out.progress(next(finished), len(figures)))
+    except EnvironmentFault:
+        if out.jobs > 1:
+            # VTK ends the worker that draws where no renderer is installed: then this says so
+            require_renderer()
+        raise
+    return sorted(found, key=lambda one: figures.index(one.figure))
 
 
 STAGE = Stage(
@@ -91,6 +110,8 @@ STAGE = Stage(
         SURFACE_ORIGINS,
         RAW_TABLE,
         SCAN_RETURNS,
+        SWEEP_FACTS,
+        NEUTRAL_CURVE,
         SMOOTH_TABLE,
         *FINDINGS.values(),
     ),

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Sequence
 
 import numpy as np
 from pydantic import Field
 
-from pipeline.adapters.contact_pool import ContactPair, map_contact
-from pipeline.artifacts import ANATOMY, MOVING_BODY, RAW_TABLE, REFERENCE_BODY, SMOOTH_TABLE
-from pipeline.contact_params import ContactParams
+from pipeline.adapters.joint_work import Joint, SolverSettings
+from pipeline.artifacts import ANATOMY, LIGAMENTS, MOVING_BODY, RAW_TABLE, REFERENCE_BODY, SMOOTH_TABLE, SWEEP_FACTS
+from pipeline.contact_params import ContactParams, fibres_of
 from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage
 from pipeline.errors import CaseRejected
-from pipeline.kinematics.cell import Cell
-from pipeline.kinematics.contact import Bodies, Pose
+from pipeline.kinematics.cell import Cell, Claim, Proof, failed_cell
+from pipeline.kinematics.contact import Pose
 from pipeline.kinematics.interpolation import found_at, pose_curves, usable_entries
-from pipeline.kinematics.smoothing import Probe, ends, entries, fit_curves, settle, way_to_contact
-from pipeline.kinematics.sweep import pose_table
+from pipeline.kinematics.smoothing import Entry, Probe, Settled, ends, entries, fit_curves
+from pipeline.kinematics.sweep import angles_rad, pose_table
 from pipeline.kinematics.table import Float, Grid, PoseTable, RawTable, SmoothTable, Status
 
 
@@ -25,7 +24,7 @@ class Params(ContactParams):
     """Degrees of the polynomials and how the result is proven."""
 
     degree_flexion: int = Field(6, ge=0, le=20, description="degree in flexion (the paper's 6)")
-    degree_varus: int = Field(2, ge=0, le=6, description="degree in varus, lowered until midpoints hold their limit")
+    degree_varus: int = Field(3, ge=0, le=6, description="degree in varus, lowered until midpoints hold their limit")
     midpoint_limit_mm: float = Field(
         0.145, gt=0, le=10, description="gap or overlap allowed half-way between entries (one arc minute at 0.5 m)"
     )
@@ -38,20 +37,23 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     """Smooth the table and prove it."""
     raw, anatomy = reads[RAW_TABLE], reads[ANATOMY]
     pair = params.pair(reads[REFERENCE_BODY], reads[MOVING_BODY], anatomy)
+    facts = reads[SWEEP_FACTS]
+    fibres = fibres_of(reads[LIGAMENTS], anatomy, pair, facts.push_n, facts.reference_strain)
+    joint = Joint(pair, SolverSettings(proof=params.proof(), fibres=fibres), out.jobs)
     wanted = min(params.degree_varus, raw.grid.shape[1] - 1)
-    table = _smoothed(raw, wanted, params, pair, out)
+    table = _smoothed(raw, wanted, params, joint)
     degree = wanted
     for lower in range(wanted - 1, -1, -1):
         if _worst_midpoint(table) <= params.midpoint_limit_mm:
             break
-        trial = _smoothed(raw, lower, params, pair, out)
+        trial = _smoothed(raw, lower, params, joint)
         if _shown(trial) >= _shown(table) and _worst_midpoint(trial) < _worst_midpoint(table):
             table, degree = trial, lower
     out[SMOOTH_TABLE] = table
     return _findings(table, wanted, degree)
 
 
-def _smoothed(raw: RawTable, degree_varus: int, params: Params, pair: ContactPair, out: Outputs) -> SmoothTable:
+def _smoothed(raw: RawTable, degree_varus: int, params: Params, joint: Joint) -> SmoothTable:
     """The table with curves of one degree in varus, in contact and tested."""
     try:
         fits = fit_curves(raw, (params.degree_flexion, degree_varus))
@@ -59,8 +61,7 @@ def _smoothed(raw: RawTable, degree_varus: int, params: Params, pair: ContactPai
         raise CaseRejected(
             "E-SMO-01", f"The curves cannot be smoothed: {error}.", "Narrow the range of angles or lower the degree."
         ) from error
-    settled = partial(settle, motion=params.motion(), proof=params.proof())
-    cells = _in_rows(map_contact(settled, entries(raw, fits, params.fill_gap_deg), pair, out.jobs), raw.grid)
+    cells = _in_rows(_cells(joint, entries(raw, fits, params.fill_gap_deg)), raw.grid)
     poses = pose_table(cells)
     return SmoothTable(
         grid=raw.grid,
@@ -68,9 +69,28 @@ def _smoothed(raw: RawTable, degree_varus: int, params: Params, pair: ContactPai
         fits=fits,
         flexion_range_deg=ends(raw.grid.flexion_deg),
         varus_range_deg=ends(raw.grid.varus_deg),
-        contact_error_mm=np.array([[_contact_error(cell) for cell in row] for row in cells]),
-        midpoint_error_mm=_midpoint_errors(raw.grid, poses, partial(way_to_contact, motion=params.motion()), pair, out),
+        contact_error_mm=np.array([[_contact_error(cell.proof) for cell in row] for row in cells]),
+        midpoint_error_mm=_midpoint_errors(raw.grid, poses, joint),
     )
+
+
+def _cells(joint: Joint, wanted: Sequence[Entry]) -> list[Cell]:
+    """Every entry in contact, certified and proven; in the order of the entries."""
+    settled = joint.settle(wanted)
+    claimed = {k: claim for k, one in enumerate(settled) if (claim := _claim(one)) is not None}
+    proofs = dict(zip(claimed, joint.prove(tuple(claimed.values()))[0], strict=True))
+    return [
+        Cell(claimed[k].pose, one.entry.status, 0, one.certificate, proofs[k])
+        if k in claimed
+        else failed_cell(Status.NO_CONTACT if one.entry.status.usable else one.entry.status)
+        for k, one in enumerate(settled)
+    ]
+
+
+def _claim(one: Settled) -> Claim | None:
+    if one.pose is None:
+        return None
+    return Claim(angles_rad((one.entry.flexion_deg, one.entry.varus_deg)), one.pose, one.certificate)
 
 
 def _shown(table: SmoothTable) -> int:
@@ -87,14 +107,12 @@ def _in_rows(cells: list[Cell], grid: Grid) -> list[list[Cell]]:
     return [cells[k : k + columns] for k in range(0, len(cells), columns)]
 
 
-def _contact_error(cell: Cell) -> float:
+def _contact_error(proof: Proof) -> float:
     """Bound of the signed way to contact: + where the entry is clear, - where it has to be pulled back."""
-    return cell.gap_after_mm if cell.gap_before_mm == 0.0 else -cell.gap_before_mm
+    return proof.gap_after_mm if proof.gap_before_mm == 0.0 else -proof.gap_before_mm
 
 
-def _midpoint_errors(
-    grid: Grid, poses: PoseTable, way: Callable[[Bodies, Probe], float], pair: ContactPair, out: Outputs
-) -> Float:
+def _midpoint_errors(grid: Grid, poses: PoseTable, joint: Joint) -> Float:
     """(F - 1, V) signed way to contact half-way between entries, as a reader interpolates; NaN where not covered."""
     flexion = 0.5 * (grid.flexion_deg[1:] + grid.flexion_deg[:-1])
     angles = np.stack(np.meshgrid(flexion, grid.varus_deg, indexing="ij"), axis=-1)
@@ -102,7 +120,7 @@ def _midpoint_errors(
     error = np.full(found.shape[:2], np.nan)
     covered = np.isfinite(found).all(axis=-1)
     probes = [_probe(attitude, pose) for attitude, pose in zip(angles[covered], found[covered], strict=True)]
-    error[covered] = map_contact(way, probes, pair, out.jobs)
+    error[covered] = joint.ways_to_contact(probes)
     return error
 
 
@@ -125,4 +143,11 @@ def _findings(table: SmoothTable, wanted: int, degree: int) -> Findings:
     return tuple(out)
 
 
-STAGE = Stage(70, "smooth", (ANATOMY, REFERENCE_BODY, MOVING_BODY, RAW_TABLE), (SMOOTH_TABLE,), Params, run)
+STAGE = Stage(
+    70,
+    "smooth",
+    (ANATOMY, REFERENCE_BODY, MOVING_BODY, LIGAMENTS, RAW_TABLE, SWEEP_FACTS),
+    (SMOOTH_TABLE,),
+    Params,
+    run,
+)

@@ -1,49 +1,85 @@
-"""Stage 60: a stable pose for every attitude of the grid, by the incremental solver, as found."""
+"""Stage 60: a stable pose for every attitude of the grid, certified and proven, as found."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from pipeline.adapters.contact_pool import ContactPair, map_contact
-from pipeline.artifacts import ANATOMY, MOVING_BODY, RAW_TABLE, REFERENCE_BODY, SCAN_RETURNS
-from pipeline.contact_params import ContactParams
+from pipeline.adapters.joint_work import Joint, SolverName, SolverSettings, claims
+from pipeline.artifacts import (
+    ANATOMY,
+    LIGAMENTS,
+    MOVING_BODY,
+    NEUTRAL_CURVE,
+    RAW_TABLE,
+    REFERENCE_BODY,
+    SCAN_RETURNS,
+    SWEEP_FACTS,
+)
+from pipeline.contact_params import ContactParams, fibres_of
 from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage
 from pipeline.errors import CaseRejected
 from pipeline.kinematics.body_frames import scan_pose
+from pipeline.kinematics.cross_check import Differences, agreeing, differences, rechecks, shallower
+from pipeline.kinematics.direct.settings import DirectSettings, MapSettings
 from pipeline.kinematics.incremental import IncrementalSettings, StablePose
-from pipeline.kinematics.sweep import Release, SweepSettings, Walk, assemble, go, let_go, ribs, spine
+from pipeline.kinematics.jumps import JumpLimits, Jumps, jumps, mended, to_solve_again
+from pipeline.kinematics.sweep import (
+    Evidence,
+    Found,
+    Place,
+    Release,
+    Walk,
+    assemble,
+    hysteresis,
+    kept,
+    ribs,
+    spine,
+)
 from pipeline.kinematics.table import Grid, RawTable, Status
-from pipeline.records import Anatomy, ScanReturn
+from pipeline.records import Anatomy, CrossCheck, JumpCount, LigamentFibre, ScanReturn, SweepFacts
 
 MAX_CELLS = 100_000
 
 
 class Params(ContactParams):
-    """The grid, and the paper's steps and resolutions (step = 10 x resolution)."""
+    """The grid, the solver and its bounds, and what is checked beside."""
 
     flexion_min_deg: float = Field(0.0, ge=-30, le=170, description="first flexion of the table")
     flexion_max_deg: float = Field(120.0, ge=-30, le=170, description="last flexion of the table")
-    flexion_step_deg: float = Field(5.0, gt=0, le=90, description="spacing in flexion; divides the range")
-    varus_min_deg: float = Field(-4.0, ge=-30, le=30, description="first varus angle (valgus is negative)")
-    varus_max_deg: float = Field(4.0, ge=-30, le=30, description="last varus angle")
-    varus_step_deg: float = Field(2.0, gt=0, le=30, description="spacing in varus; divides the range")
-    translation_step_mm: float = Field(1.0, gt=0, le=100, description="step of translations")
+    flexion_step_deg: float = Field(1.0, gt=0, le=90, description="spacing in flexion; divides the range")
+    varus_min_deg: float = Field(-5.0, ge=-30, le=30, description="first varus angle (valgus is negative)")
+    varus_max_deg: float = Field(5.0, ge=-30, le=30, description="last varus angle")
+    varus_step_deg: float = Field(1.0, gt=0, le=30, description="spacing in varus; divides the range")
+    solver: SolverName = Field("direct", description="direct, or incremental: the paper's, a hundred times slower")
+    map_spacing_mm: float = Field(0.6, ge=0.05, le=5, description="nodes of the direct solver's height map")
+    translation_step_mm: float = Field(1.0, gt=0, le=100, description="incremental: step of translations")
     translation_resolution_mm: float = Field(0.1, gt=0, le=5, description="step at which a translation is spent")
-    rotation_step_deg: float = Field(1.0, gt=0, le=45, description="step of rotations about delta")
+    rotation_step_deg: float = Field(1.0, gt=0, le=45, description="incremental: step of rotations about delta")
     rotation_resolution_deg: float = Field(0.1, gt=0, le=5, description="step at which a rotation is spent")
     slide_bound_mm: float = Field(30.0, gt=0, le=200, description="farther than this from the scan pose: slid off")
     rotation_bound_deg: float = Field(30.0, gt=0, le=179, description="farther than this from the scan pose: bound")
-    max_motions: int = Field(400, ge=10, le=100_000, description="motions after which a cell is not converged")
+    max_motions: int = Field(400, ge=10, le=100_000, description="incremental: motions after which a cell is given up")
+    classic: bool = Field(default=False, description="incremental: the paper's plain rules, not only deeper")
+    ligaments: bool = Field(default=False, description="let the fibres of ligaments.csv pull")
+    push_n: float = Field(10.0, gt=0, le=5000, description="push along delta that the fibres pull against, newtons")
+    reference_strain: float = Field(
+        0.0, gt=-0.5, le=0.5, description="stretch at the scan pose of fibres without a slack length of their own"
+    )
+    jump_mm: float = Field(
+        0.75, gt=0, le=20, description="neighbours that differ by more, beyond what is usual: a jump"
+    )
+    jump_deg: float = Field(3.0, gt=0, le=45, description="the same for the rotation")
+    jump_rounds: int = Field(1, ge=0, le=20, description="how often jumps are solved again from all sides")
+    cross_check_fraction: float = Field(0.05, ge=0, le=1, description="share of cells that the other solver solves too")
     scan_shift_mm: float = Field(
         2.0, ge=0, le=20, description="how far from the scan pose the body is let go, as a test"
     )
     scan_turn_deg: float = Field(3.0, ge=0, le=30, description="the same for the rotation")
-    classic: bool = Field(default=False, description="the paper's plain rules, without the deeper-only guard")
 
     @model_validator(mode="after")
     def _grid_is_whole(self) -> Self:
@@ -58,6 +94,11 @@ class Params(ContactParams):
         if cells > MAX_CELLS:
             raise ValueError(f"the grid has {cells} cells, at most {MAX_CELLS}")
         return self
+
+    @property
+    def ligament_push_n(self) -> float:
+        """The push that ligaments pull against; 0 where they take no part."""
+        return self.push_n if self.ligaments else 0.0
 
     def grid(self) -> Grid:
         """The attitudes of the table."""
@@ -74,33 +115,65 @@ def _values(low: float, high: float, step: float) -> np.ndarray[tuple[int], np.d
 def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     """Sweep the grid."""
     anatomy, grid = reads[ANATOMY], params.grid()
+    scan = scan_pose(anatomy.scan_attitude)
     pair = params.pair(reads[REFERENCE_BODY], reads[MOVING_BODY], anatomy)
-    scan, progress = scan_pose(anatomy.scan_attitude), _Progress(out, int(np.prod(grid.shape)))
-    work = partial(go, settings=_settings(params))
+    fibres = fibres_of(_wanted(reads, params), anatomy, pair, params.ligament_push_n, params.reference_strain)
+    joint = Joint(pair, replace(_settings(params), fibres=fibres), out.jobs)
+    progress = _Progress(out, int(np.prod(grid.shape)))
     first = spine(grid, anatomy.scan_attitude[0], anatomy.scan_attitude[1], scan)
-    along = map_contact(work, first, pair, out.jobs, progress.of(first))
+    along = joint.walk(first, progress.of(first))
     across = ribs(grid, along, scan)
-    table = assemble(grid, [*along, *map_contact(work, across, pair, out.jobs, progress.of(across))])
-    if not (table.poses.status == Status.OK).any():
-        raise CaseRejected(
-            "E-SWP-01",
-            f"No stable pose at any of {table.poses.status.size} attitudes: {_counts(table)}.",
-            "Check that cartilage and menisci are labelled, and that the bones are those of one joint.",
-        )
+    walked = [*along, *joint.walk(across, progress.of(across))]
+    found, limits = kept(walked), JumpLimits(params.jump_mm, params.jump_deg)
+    before = jumps(grid, found, limits)
+    found = mended(found, lambda now: to_solve_again(grid, now, limits, scan), joint.solve_again, params.jump_rounds)
+    if not any(one.stable.status.usable for one in found.values()):
+        raise _nothing_stable(found)
+    asked = rechecks(grid, found, params.cross_check_fraction, scan)
+    known = joint.certify(grid, found)
+    claimed = claims(grid, found, known)
+    proven, answers = joint.prove(tuple(claimed.values()), asked)
+    proofs = dict(zip(claimed, proven, strict=True))
+    table = assemble(grid, found, Evidence(known, proofs), hysteresis(grid, walked))
     out[RAW_TABLE] = table
-    out[SCAN_RETURNS] = _scan_returns(anatomy, params, pair, out.jobs)
-    return _findings(table)
+    out[SCAN_RETURNS] = _scan_returns(anatomy, params, joint)
+    out[NEUTRAL_CURVE] = joint.neutral(table, anatomy.scan_attitude[1], scan)
+
+    out[SWEEP_FACTS] = facts = _facts(params, (before, jumps(grid, found, limits)), differences(found, asked, answers))
+    return _findings(table, facts)
 
 
-def _scan_returns(anatomy: Anatomy, params: Params, pair: ContactPair, jobs: int) -> tuple[ScanReturn, ...]:
-    """The body let go at the scan's own attitude, at the scan pose and away from it to every side."""
+def _wanted(reads: Inputs, params: Params) -> tuple[LigamentFibre, ...]:
+    fibres = reads[LIGAMENTS]
+    if params.ligaments and not fibres:
+        raise CaseRejected(
+            "E-LIG-04",
+            "The settings ask for ligaments, and the case has none.",
+            "Add a ligaments.csv to the case folder, or set sweep.ligaments to false.",
+        )
+    return fibres
+
+
+def _nothing_stable(found: Mapping[Place, Found]) -> CaseRejected:
+    """The spine found nothing, so no rib was begun."""
+    ends = [one.stable.status for one in found.values()]
+    return CaseRejected(
+        "E-SWP-01",
+        f"No stable pose at any of {len(ends)} flexions at the varus of the scan: {_counts(ends)}.",
+        "Check that cartilage and menisci are labelled, and that the bones are those of one joint.",
+    )
+
+
+def _scan_returns(anatomy: Anatomy, params: Params, joint: Joint) -> tuple[ScanReturn, ...]:
+    """The body let go at the scan's own attitude, at the scan pose, to every side of it, and aslant both ways."""
     scan = scan_pose(anatomy.scan_attitude)
     flexion, varus = anatomy.scan_attitude[:2]
     shift, turn = params.scan_shift_mm, float(np.radians(params.scan_turn_deg))
     aways = [(0.0, 0.0, 0.0)]
     aways += [way for s in (1.0, -1.0) for way in ((s * shift, 0.0, 0.0), (0.0, s * shift, 0.0), (0.0, 0.0, s * turn))]
+    aways += [(s * 0.75 * shift, 0.75 * shift, s * turn) for s in (1.0, -1.0)]
     releases = [Release(flexion, varus, scan, away) for away in aways]
-    found = map_contact(partial(let_go, settings=_settings(params)), releases, pair, jobs)
+    found = joint.release(releases)
     return tuple(_scan_return(release, stable) for release, stable in zip(releases, found, strict=True))
 
 
@@ -134,42 +207,89 @@ class _Progress:
         return done
 
 
-def _settings(params: Params) -> SweepSettings:
-    solver = IncrementalSettings(
+def _settings(params: Params) -> SolverSettings:
+    rotation_bound = float(np.radians(params.rotation_bound_deg))
+    incremental = IncrementalSettings(
         translation_step_mm=params.translation_step_mm,
         translation_resolution_mm=params.translation_resolution_mm,
         rotation_step_rad=float(np.radians(params.rotation_step_deg)),
         rotation_resolution_rad=float(np.radians(params.rotation_resolution_deg)),
         contact_band_mm=params.contact_band_mm,
         slide_bound_mm=params.slide_bound_mm,
-        rotation_bound_rad=float(np.radians(params.rotation_bound_deg)),
+        rotation_bound_rad=rotation_bound,
         max_motions=params.max_motions,
         gain_mm=max(5e-4, 2.5 * params.contact_tolerance_mm),
         classic=params.classic,
         motion=params.motion(),
     )
-    return SweepSettings(solver, params.proof())
+    return SolverSettings(
+        name=params.solver,
+        incremental=incremental,
+        direct=DirectSettings(slide_bound_mm=params.slide_bound_mm, rotation_bound_rad=rotation_bound),
+        map=MapSettings(spacing_mm=params.map_spacing_mm),
+        proof=params.proof(),
+    )
 
 
-def _counts(table: RawTable) -> str:
-    values, counts = np.unique(table.poses.status, return_counts=True)
+def _facts(params: Params, jumped: tuple[Jumps, Jumps], different: Differences) -> SweepFacts:
+    before, after = (JumpCount(len(one.places), round(one.largest_mm, 6), round(one.largest_deg, 6)) for one in jumped)
+    return SweepFacts(
+        solver=params.solver,
+        push_n=params.ligament_push_n,
+        reference_strain=params.reference_strain,
+        jumps_before=before,
+        jumps_after=after,
+        cross_check=CrossCheck(
+            cells=len(different.shift_mm),
+            agreeing=agreeing(different, params.translation_resolution_mm, params.rotation_resolution_deg),
+            shallower=shallower(different),
+            shift_mm=float(different.shift_mm.max(initial=0.0)),
+            rotation_deg=float(different.rotation_deg.max(initial=0.0)),
+            deeper_mm=float(different.deeper_mm.max(initial=0.0)),
+            shallower_mm=float((-different.deeper_mm).max(initial=0.0)),
+        ),
+    )
+
+
+def _counts(ends: Sequence[int]) -> str:
+    values, counts = np.unique(np.asarray(ends, dtype=np.uint8), return_counts=True)
     return ", ".join(
         f"{count} {Status(int(value)).name.lower().replace('_', ' ')}"
         for value, count in zip(values, counts, strict=True)
     )
 
 
-def _findings(table: RawTable) -> Findings:
-    note = Finding("N-SWP-01", Severity.NOTE, f"{table.poses.status.size} attitudes: {_counts(table)}.")
-    failed = int((table.poses.status != Status.OK).sum())
-    if not failed:
-        return (note,)
-    review = Finding(
-        "W-SWP-01",
-        Severity.REVIEW,
-        f"{failed} of {table.poses.status.size} attitudes have no stable pose ({_counts(table)}).",
-    )
-    return note, review
+def _findings(table: RawTable, facts: SweepFacts) -> Findings:
+    status = table.poses.status.ravel()
+    counts = _counts(status.tolist())
+    found = [Finding("N-SWP-01", Severity.NOTE, f"{len(status)} attitudes: {counts}.")]
+    failed = int((status != Status.OK).sum())
+    if failed:
+        message = f"{failed} of {len(status)} attitudes have no stable pose ({counts})."
+        found.append(Finding("W-SWP-01", Severity.REVIEW, message))
+    if facts.jumps_before.count:
+        message = (
+            f"{facts.jumps_before.count} jumps between neighbouring attitudes, {facts.jumps_after.count} after solving "
+            f"them again from all sides; the largest left is {facts.jumps_after.largest_mm:.1f} mm, "
+            f"{facts.jumps_after.largest_deg:.1f} deg."
+        )
+        found.append(Finding("N-SWP-02", Severity.NOTE, message))
+    check = facts.cross_check
+    if check.cells:
+        message = (
+            f"{check.cells} attitudes solved by the other solver too: {check.agreeing} agree within its resolutions; "
+            f"largest difference {check.shift_mm:.2f} mm, {check.rotation_deg:.2f} deg. "
+            f"The table's pose is shallower in {check.shallower} (at most {check.shallower_mm:.3f} mm)."
+        )
+        found.append(Finding("N-SWP-03", Severity.NOTE, message))
+    return tuple(found)
 
 
-STAGE = Stage(60, "sweep", (ANATOMY, REFERENCE_BODY, MOVING_BODY), (RAW_TABLE, SCAN_RETURNS), Params, run)
+STAGE = Stage(
+    60,
+    "sweep",
+    (ANATOMY, REFERENCE_BODY, MOVING_BODY, LIGAMENTS),
+    (RAW_TABLE, SCAN_RETURNS, NEUTRAL_CURVE, SWEEP_FACTS),
+    Params,
+    run,
+)

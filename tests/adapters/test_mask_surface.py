@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.adapters import mask_surface
-from pipeline.adapters.mask_surface import SurfaceSettings, mask_to_mesh
+from pipeline.adapters.mask_surface import SurfaceResult, SurfaceSettings, SurfaceTask, mask_to_mesh, meshes_of
 from pipeline.geometry.mesh import TriangleMesh, check_closed, face_normals, genus, volume_mm3
 from tests.geometry.meshes import ball, centred, grid, turned
 
@@ -139,3 +139,23 @@ def test_equal_input_gives_equal_bits() -> None:
 def test_a_matrix_that_leads_nowhere_is_refused() -> None:
     with pytest.raises(ValueError, match="finite, invertible"):
         mask_to_mesh(ball(3.0, (1.0, 1.0, 1.0)), np.diag([1.0, 0.0, 1.0, 1.0]), SETTINGS)
+
+
+def _tasks() -> list[SurfaceTask]:
+    masks = [_torus_mask((0.5, 0.5, 0.5)), np.zeros((4, 4, 4), dtype=np.bool_), ball(6.0, (0.5, 0.5, 0.5))]
+    return [SurfaceTask(mask, np.diag([0.5, 0.5, 0.5, 1.0]), SETTINGS, np.zeros_like(mask)) for mask in masks]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_many_masks_give_their_meshes_or_their_defects_in_their_order(jobs: int) -> None:
+    finished: list[int] = []
+    torus, defect, sphere = meshes_of(_tasks(), jobs, finished.append)
+    assert isinstance(torus, SurfaceResult)
+    assert isinstance(sphere, SurfaceResult)
+    assert isinstance(defect, ValueError)
+    assert "at least one voxel" in str(defect)
+    assert (genus(torus.mesh), genus(sphere.mesh)) == (1, 0)
+    assert sorted(finished) == [0, 1, 2]
+    alone = mask_to_mesh(_torus_mask((0.5, 0.5, 0.5)), np.diag([0.5, 0.5, 0.5, 1.0]), SETTINGS)
+    assert torus.mesh.points.tobytes() == alone.mesh.points.tobytes()
+    assert torus.mesh.triangles.tobytes() == alone.mesh.triangles.tobytes()

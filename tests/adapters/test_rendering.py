@@ -11,7 +11,7 @@ import pytest
 from pipeline.adapters import rendering
 from pipeline.adapters.rendering import Image, Surface, distances_mm, snapshots
 from pipeline.errors import EnvironmentFault
-from pipeline.geometry.mesh import TriangleMesh, transformed
+from pipeline.geometry.mesh import TriangleMesh, flipped, transformed
 from pipeline.geometry.views import Direction, View, view
 from pipeline.records import Side
 from tests.report.sample import frame_of, revolved
@@ -94,6 +94,22 @@ def test_distances_to_a_ball() -> None:
     points = np.array([[0.0, 0.0, 12.0], [9.0, 0.0, 0.0], [0.0, 5.0, 0.0]])
     assert distances_mm(points, ball()) == pytest.approx([4.0, 1.0, -3.0], abs=0.06)
     assert distances_mm(np.empty((0, 3)), ball()).shape == (0,)
+
+
+def test_one_scene_leaves_nothing_in_the_next() -> None:
+    seen = [view(np.eye(4), "anterior", np.zeros(3), 20.0)]
+    (first,) = pictures(ball(), seen)
+    pictures(ball(15.0), [view(np.eye(4), "proximal", np.full(3, 5.0), 90.0)])
+    snapshots([Surface(ball(3.0), RED, plain=True)], seen, (60, 90))
+    (again,) = pictures(ball(), seen)
+    assert (first == again).all()
+
+
+def test_what_faces_away_is_hidden_and_not_drawn() -> None:
+    """Of a ball turned inside out only the far side is left."""
+    seen = [view(np.eye(4), "anterior", np.zeros(3), 20.0)]
+    (outward,), (inward,) = pictures(ball(), seen), pictures(flipped(ball()), seen)
+    assert (outward != inward).any()
 
 
 @pytest.fixture

@@ -112,6 +112,18 @@ def test_vtk_errors_become_exceptions(capfd: pytest.CaptureFixture[str]) -> None
     assert capfd.readouterr().err == ""
 
 
+def test_warnings_are_raised_only_where_they_are_wanted() -> None:
+    def warn() -> None:
+        vtkOutputWindow.GetInstance().DisplayWarningText("Warning: In a.cxx, line 1: slow")
+
+    with pytest.raises(VtkError, match="slow"), vtk_errors_raised():
+        warn()
+    with vtk_errors_raised(warnings=False):
+        warn()
+    with pytest.raises(VtkError, match="not optional"), vtk_errors_raised(warnings=False):
+        vtkQuadricDecimation().Update()
+
+
 def test_vtk_reports_where_it_did_before_after_the_block() -> None:
     before = vtkOutputWindow.GetInstance()
     with vtk_errors_raised():

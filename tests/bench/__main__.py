@@ -1,4 +1,4 @@
-"""Prints one table and writes build/bench.json: a phantom patient, contact queries, the solver, look-up."""
+"""Prints one table and writes build/bench.json: patients, contact queries, both solvers, look-up."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ import resource
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
-from statistics import median
 
 import numpy as np
 
@@ -19,44 +18,22 @@ from pipeline.config import load_settings
 from pipeline.contact_params import ContactParams
 from pipeline.engine.outcome import Execution, RunOutcome
 from pipeline.engine.runner import CaseJob, run_case
-from pipeline.files.phantom_case import write_phantom_case
 from pipeline.flow import FLOW
-from pipeline.geometry.phantom_spec import PhantomSpec
 from pipeline.kinematics.body_frames import scan_pose
 from pipeline.kinematics.contact import AttitudeContact
 from pipeline.kinematics.descent import drop
-from pipeline.kinematics.incremental import IncrementalSettings, solve_incremental
 from pipeline.playback import Lut
+from tests.bench import Figure, seconds, sweeps
+from tests.bench.knees import cases
 from tests.end_to_end.knee_runs import Silent
 
 REPORT = Path("build/bench.json")
 
 
-@dataclass(frozen=True)
-class Figure:
-    """One row: a name, what was measured, its unit, and what it is a multiple of."""
-
-    name: str
-    value: float
-    unit: str
-    ratio: str = ""
-
-
-def seconds(work: Callable[[], object], repeats: int) -> float:
-    """Median wall time of one call."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return median(times)
-
-
-def patient(folder: Path) -> tuple[RunOutcome, RunOutcome, float]:
-    """A demo patient from nothing and again from the cache; the seconds of the second."""
-    write_phantom_case(folder / "cases" / "bench", PhantomSpec())
-    settings = load_settings(FLOW, folder / "cases" / "bench", "demo")
-    job = CaseJob("bench", folder / "cases" / "bench", folder / "results" / "bench")
+def patient(case: Path, folder: Path) -> tuple[RunOutcome, RunOutcome, float]:
+    """A patient from labels to package with every default, and again from the cache; the seconds of the second."""
+    settings = load_settings(FLOW, case, "clinical")
+    job = CaseJob("bench", case, folder / "results")
 
     def process() -> RunOutcome:
         return run_case(job, FLOW, settings, Execution(jobs=2), Silent())
@@ -64,7 +41,9 @@ def patient(folder: Path) -> tuple[RunOutcome, RunOutcome, float]:
     first = process()
     start = time.perf_counter()
     again = process()
-    return first, again, time.perf_counter() - start
+    took = time.perf_counter() - start
+    assert {stage.state for stage in again.stages} == {"cached"}
+    return first, again, took
 
 
 def patient_figures(first: RunOutcome, cached_s: float) -> Iterator[Figure]:
@@ -77,7 +56,7 @@ def patient_figures(first: RunOutcome, cached_s: float) -> Iterator[Figure]:
 
 
 def contact_figures(results: Path) -> Iterator[Figure]:
-    """Queries of the exact collision test, a drop, and a cell of the incremental solver."""
+    """Queries of the exact collision test, and a drop."""
     anatomy = ANATOMY.decode({"": (results / "40_anatomy" / ANATOMY.file).read_bytes()})
     reference = REFERENCE_BODY.decode({"": (results / "50_contact" / REFERENCE_BODY.file).read_bytes()})
     moving = MOVING_BODY.decode({"": (results / "50_contact" / MOVING_BODY.file).read_bytes()})
@@ -94,10 +73,6 @@ def contact_figures(results: Path) -> Iterator[Figure]:
     yield Figure("contacts_ms", 1e3 * features, "ms", f"{features / yes_no:.1f} yes/no tests")
     fall = seconds(lambda: drop(contact, rest._replace(z=rest.z - 1.0), params.motion()), 10)
     yield Figure("drop_ms", 1e3 * fall, "ms", f"{fall / yes_no:.1f} yes/no tests")
-    starts = [rest.displaced(away) for away in ((0.5, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.02))]
-    solver = IncrementalSettings(motion=params.motion())
-    cell = median([seconds(lambda s=start: solve_incremental(contact, s, solver), 1) for start in starts])  # type: ignore[misc]
-    yield Figure("incremental_cells_per_s", 1.0 / cell, "1/s", f"a cell costs {cell / yes_no:.0f} yes/no tests")
 
 
 def lookup_figures(lut: Lut) -> Iterator[Figure]:
@@ -116,25 +91,26 @@ def peak_memory_mb() -> float:
     return max(resource.getrusage(one).ru_maxrss for one in who) / 1024.0
 
 
-def figures(folder: Path) -> Iterator[Figure]:
-    """Everything, in order."""
-    first, again, cached_s = patient(folder)
-    assert {stage.state for stage in again.stages} == {"cached"}
-    results = folder / "results" / "bench"
+def patient_and_queries(folder: Path) -> Iterator[Figure]:
+    """The real knee from labels to package where it is present, else the phantom; then what it is made of."""
+    _, case = list(cases(folder))[-1]
+    first, _, cached_s = patient(case, folder)
     yield from patient_figures(first, cached_s)
-    yield from contact_figures(results)
-    yield from lookup_figures(Lut.open(results / "90_package" / "lut.h5"))
-    yield Figure("peak_rss_mb", peak_memory_mb(), "MB", "largest of the processes")
+    yield Figure("peak_rss_mb", peak_memory_mb(), "MB", "largest of the processes of a patient")
+    yield from contact_figures(folder / "results")
+    yield from lookup_figures(Lut.open(folder / "results" / "90_package" / "lut.h5"))
 
 
 def main() -> None:
     """Measure and print each row as soon as it is known."""
     measured = {}
-    with tempfile.TemporaryDirectory() as folder:
-        for figure in figures(Path(folder)):
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for figure in chain(patient_and_queries(folder), sweeps.figures(folder)):
             measured[figure.name] = figure.value
-            sys.stdout.write(f"{figure.name:<28}{figure.value:>12.4g} {figure.unit:<5}{figure.ratio}\n")
+            sys.stdout.write(f"{figure.name:<38}{figure.value:>12.4g} {figure.unit:<5}{figure.ratio}\n")
             sys.stdout.flush()
+    measured |= sweeps.headlines(measured)
     REPORT.parent.mkdir(exist_ok=True)
     REPORT.write_text(json.dumps(measured, indent=1, sort_keys=True) + "\n")
 

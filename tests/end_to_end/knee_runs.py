@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.artifacts import RAW_TABLE, SMOOTH_TABLE
+from pipeline.artifacts import NEUTRAL_CURVE, RAW_TABLE, SMOOTH_TABLE
 from pipeline.config import load_settings
 from pipeline.engine.outcome import Execution, RunOutcome
 from pipeline.engine.runner import CaseJob, run_case
@@ -19,6 +19,7 @@ from pipeline.flow import FLOW
 from pipeline.geometry.phantom import phantom_labels
 from pipeline.geometry.phantom_spec import PhantomSpec
 from pipeline.geometry.volume import LabelVolume
+from pipeline.kinematics.neutral import NeutralCurve
 from pipeline.kinematics.table import PoseTable
 
 #: Up to the smoothed table: the numbers, without pictures and package.
@@ -35,6 +36,7 @@ COARSE = (
     "sweep.flexion_step_deg=10.0",
     "sweep.varus_min_deg=-2.0",
     "sweep.varus_max_deg=2.0",
+    "sweep.varus_step_deg=2.0",
     "sweep.scan_shift_mm=1.0",
     "qa.pictures.panel_px=240",
 )
@@ -93,6 +95,11 @@ def poses(results: Path) -> tuple[PoseTable, PoseTable]:
     raw = RAW_TABLE.decode({"": (results / "60_sweep" / RAW_TABLE.file).read_bytes()})
     smooth = SMOOTH_TABLE.decode({"": (results / "70_smooth" / SMOOTH_TABLE.file).read_bytes()})
     return raw.poses, smooth.poses
+
+
+def neutral(results: Path) -> NeutralCurve:
+    """The neutral curve of a case's results."""
+    return NEUTRAL_CURVE.decode({"": (results / "60_sweep" / NEUTRAL_CURVE.file).read_bytes()})
 
 
 def largest_difference(first: PoseTable, second: PoseTable) -> tuple[float, float]:

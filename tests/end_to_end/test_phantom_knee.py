@@ -19,6 +19,7 @@ from pipeline.engine.outcome import RunOutcome
 from pipeline.errors import ExitCode
 from pipeline.flow import FLOW
 from pipeline.geometry.phantom_spec import PhantomSpec
+from pipeline.kinematics.neutral import EVEN_MM
 from pipeline.kinematics.table import Status
 from pipeline.playback import Lut
 from tests.end_to_end.knee_runs import (
@@ -27,6 +28,7 @@ from tests.end_to_end.knee_runs import (
     files_of,
     largest_difference,
     mirrored_case,
+    neutral,
     phantom_case,
     poses,
     run,
@@ -66,6 +68,13 @@ def test_every_cell_is_in_proven_contact(done: Done) -> None:
     assert (raw.status == Status.OK).all()
     assert (smooth.status == Status.OK).all()
     assert np.nanmax(raw.equilibrium_residual) < 0.02
+
+
+def test_at_neutral_varus_both_compartments_touch(done: Done) -> None:
+    curve = neutral(done.results)
+    assert (curve.status == Status.OK).all()
+    assert np.abs(curve.uneven_mm).max() <= EVEN_MM
+    assert np.abs(curve.varus_deg).max() <= 2.0
 
 
 def test_a_stranger_can_verify_the_package(done: Done) -> None:
@@ -108,6 +117,8 @@ def test_the_mirrored_knee_gives_the_mirrored_table(done: Done, tmp_path: Path) 
     run(mirrored_case(tmp_path / "cases", "left"), tmp_path / "results")
     for mine, other in zip(poses(done.results), poses(tmp_path / "results" / "left"), strict=True):
         assert max(largest_difference(mine, other)) < 1e-6
+    here, there = neutral(done.results), neutral(tmp_path / "results" / "left")
+    np.testing.assert_allclose(there.varus_deg, here.varus_deg, rtol=0, atol=1e-6)
 
 
 def test_a_moved_header_gives_the_same_table(done: Done, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pipeline.files.lut_content import LutFileContent
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.kinematics.joint_coordinates import rigid, rotation_x, rotation_y, rotation_z
+from pipeline.kinematics.neutral import NeutralCurve
 from pipeline.kinematics.table import CurveFit, Grid, PoseTable, RawTable, SmoothTable, Status
 
 Float = NDArray[np.float64]
@@ -56,12 +57,22 @@ def frames(side: str) -> tuple[Float, Float]:
     )
 
 
+def neutral(grid: Grid) -> NeutralCurve:
+    """Straight lines, each its own; no neutral varus at the last flexion where there are several."""
+    along = np.linspace(-1.0, 1.0, grid.shape[0])
+    status = np.zeros(grid.shape[0], dtype=np.uint8)
+    status[1:][-1:] = Status.NO_CONTACT
+    names = ("varus_deg", "lateral_mm", "anterior_mm", "proximal_mm", "internal_rotation_deg", "uneven_mm")
+    lines = {name: np.where(status == Status.OK, along + k, np.nan) for k, name in enumerate(names)}
+    return NeutralCurve(grid.flexion_deg, **lines, status=status)
+
+
 def content(side: str = "right", grid: Grid = GRID, bad: tuple[tuple[int, int], ...] = ()) -> LutFileContent:
     """A whole table file."""
     table = poses(grid, bad)
     count = np.ones(grid.shape, dtype=np.int32)
     number = np.full(grid.shape, 0.25)
-    raw = RawTable(grid, table, count, number, number, np.full(grid.shape, np.nan), number)
+    raw = RawTable(grid, table, count, number, number, np.full(grid.shape, np.nan), number, *3 * (2.0 * number,))
     smooth = SmoothTable(
         grid,
         table,
@@ -81,6 +92,7 @@ def content(side: str = "right", grid: Grid = GRID, bad: tuple[tuple[int, int], 
         software="ct2lut 0.0.0",
         smooth=smooth,
         raw=raw,
+        neutral=neutral(grid),
         scan_from_reference=reference,
         scan_from_moving=moving,
         delta=moving[:3, 2].copy(),

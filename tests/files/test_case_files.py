@@ -20,7 +20,7 @@ OTHERS = ["case.yaml", "labels.json", "ct/0001.dcm", "notes/labels.nrrd", "meshe
 )
 def test_one_label_map(name: str) -> None:
     chosen = choose_files([*OTHERS, name])
-    assert (chosen.label_map, dict(chosen.meshes), chosen.landmarks) == (name, {}, None)
+    assert (chosen.label_map, dict(chosen.meshes), chosen.landmarks, chosen.ligaments) == (name, {}, None, None)
     assert chosen.names == (name,)
 
 
@@ -29,6 +29,13 @@ def test_meshes_and_landmarks() -> None:
     assert chosen.label_map is None
     assert dict(chosen.meshes) == {"femur": "meshes/femur.ply", "tibia": "meshes/tibia.stl"}
     assert chosen.names == ("meshes/femur.ply", "meshes/tibia.stl", "landmarks.mrk.json")
+
+
+@pytest.mark.parametrize("name", ["ligaments.csv", "Ligaments.CSV"])
+def test_ligaments(name: str) -> None:
+    chosen = choose_files(["labels.nrrd", name, "old_ligaments.csv", "notes/ligaments.csv", "lut.csv"])
+    assert chosen.ligaments == name
+    assert chosen.names == ("labels.nrrd", name)
 
 
 @pytest.mark.parametrize(
@@ -40,6 +47,7 @@ def test_meshes_and_landmarks() -> None:
         (["labels.nii", "a.seg.nrrd"], "E-IO-16", r"a\.seg\.nrrd, labels\.nii"),
         (["labels.nii", "meshes/femur.ply"], "E-IO-16", r"labels\.nii, meshes/femur\.ply"),
         (["labels.nii", "a.fcsv", "b.mrk.json"], "E-IO-16", r"landmark file: a\.fcsv, b\.mrk\.json"),
+        (["labels.nii", "ligaments.csv", "Ligaments.csv"], "E-IO-16", r"ligament file: Ligaments\.csv, ligaments\.csv"),
         (["meshes/femur.ply", "meshes/femur.stl"], "E-IO-16", "mesh of one structure"),
     ],
 )

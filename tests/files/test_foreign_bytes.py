@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import CaseRejected
+from pipeline.files.ligaments_file import read_ligaments
 from pipeline.files.markups import read_markups
 from pipeline.files.meshes import encode_ply, encode_stl, read_mesh
 from pipeline.files.volumes import read_label_map
@@ -36,6 +37,10 @@ _MARKUPS = (
     b'{"@schema": "https://x/markups-schema-v1.0.3.json#", "markups": [{"type": "Fiducial", "coordinateSystem": "LPS",'
     b' "controlPoints": [{"label": "a", "position": [1.0, 2.0, 3.0], "positionStatus": "defined"}]}]}'
 )
+_LIGAMENTS = b"""name,reference_x,reference_y,reference_z,moving_x,moving_y,moving_z,slack_mm,stiffness_n,kind
+ACL am,1.5,-2,30.25,4,5,-6,28.5,820,spring
+PCL,5,10,0.5,6,12,-30,31.25,,cord
+"""
 #: File name -> writer and reader; mutations fall on the first bytes, where the headers are.
 SAMPLES: dict[str, tuple[Callable[[Path], bytes], Reader]] = {
     "labels.nii": (lambda _: nifti_bytes(knee_like(), compressed=False), read_label_map),
@@ -48,6 +53,7 @@ SAMPLES: dict[str, tuple[Callable[[Path], bytes], Reader]] = {
     "femur.stl": (lambda _: encode_stl(_MESH), read_mesh),
     "landmarks.fcsv": (lambda _: _FCSV, read_markups),
     "landmarks.mrk.json": (lambda _: _MARKUPS, read_markups),
+    "ligaments.csv": (lambda _: _LIGAMENTS, read_ligaments),
 }
 
 
@@ -85,5 +91,5 @@ def test_mutations_end_in_a_result_or_a_refusal(name: str, tmp_path: Path) -> No
 @pytest.mark.parametrize("name", SAMPLES)
 @pytest.mark.parametrize("data", [b"", b"\0", b"\n", b"<html>404</html>", bytes(5000), b"\xff" * 5000])
 def test_what_is_something_else_is_refused(name: str, data: bytes) -> None:
-    with pytest.raises(CaseRejected, match=rf"^E-(IO|LMK|LBL)-\d\d .*{name}"):
+    with pytest.raises(CaseRejected, match=rf"^E-(IO|LMK|LBL|LIG)-\d\d .*{name}"):
         SAMPLES[name][1](data, name)

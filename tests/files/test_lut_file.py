@@ -157,6 +157,17 @@ def test_what_is_unusable_is_nan(good: bytes) -> None:
             assert np.isnan(file["lut/lateral_mm"][cell])
 
 
+def test_the_neutral_curve_runs_along_the_flexion_of_the_grid(good: bytes) -> None:
+    expected = content(bad=BAD).neutral
+    with h5py.File(io.BytesIO(good)) as file:
+        assert set(file["neutral"]) == {field.name for field in fields(expected)} - {"flexion_deg"}
+        for name, dataset in file["neutral"].items():
+            assert dataset.dims[0].values() == [file["grid/flexion_deg"]], name
+            np.testing.assert_array_equal(dataset, getattr(expected, name))
+        assert np.isnan(file["neutral/varus_deg"][-1])
+        assert file["neutral/status"][-1] == Status.NO_CONTACT
+
+
 @pytest.mark.parametrize("group", ["/", "lut", "raw", "grid"])
 def test_xarray_names_the_coordinates(tmp_path: Path, good: bytes, group: str) -> None:
     xarray = pytest.importorskip("xarray")
@@ -285,6 +296,10 @@ FOREIGN: dict[str, tuple[Callable[[Any], object], str]] = {
             "bodies/moving/points", data=np.zeros((10**6, 3)), chunks=(10**6, 3), compression="gzip", compression_opts=9
         ),
         r"declares 24000000 bytes and stores \d+$",
+    ),
+    "short neutral curve": (
+        _remake("neutral/varus_deg", data=np.zeros(12)),
+        "/neutral/varus_deg: expected 13 values along flexion_deg, got 12",
     ),
     "intervals": (_remake("smoothing/midpoint_error_mm", data=np.zeros((13, 4))), "expected 12 flexion intervals"),
     "edited table": (lambda f: f["lut/lateral_mm"].__setitem__((0, 0), 9.0), "/lut/moved_from_scan: does not follow"),

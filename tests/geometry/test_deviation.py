@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from pipeline.geometry.deviation import deviation, distances
 from pipeline.geometry.mesh import TriangleMesh
@@ -20,6 +21,19 @@ def test_points_on_the_surface_have_no_distance() -> None:
     mesh = torus(10.0, 3.0, 60, 40)
     inside_faces = mesh.points[mesh.triangles].mean(axis=1)
     assert distances(inside_faces, mesh).max() < 1e-9
+
+
+def test_distances_are_those_of_a_search_through_all_triangles() -> None:
+    """Against the least distance from many points spread over every triangle."""
+    mesh, points = torus(10.0, 3.0, 24, 16), np.random.default_rng(2).normal(0.0, 8.0, (300, 3))
+    u, v = np.meshgrid(np.linspace(0.0, 1.0, 41), np.linspace(0.0, 1.0, 41))
+    u, v = u[u + v <= 1.0], v[u + v <= 1.0]
+    a, b, c = (mesh.points[mesh.triangles[:, k]][:, None, :] for k in range(3))
+    spread = (a + u[:, None] * (b - a) + v[:, None] * (c - a)).reshape(-1, 3)
+    reference = KDTree(spread).query(points)[0]
+    found = distances(points, mesh)
+    assert (found <= reference + 1e-12).all()
+    assert (reference - found).max() < 0.06
 
 
 def test_a_torus_inside_another() -> None:

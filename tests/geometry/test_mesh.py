@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.mesh import (
+    EdgeDefects,
     TriangleMesh,
     area_mm2,
     check_closed,
@@ -142,3 +143,16 @@ def test_a_closed_mesh_has_no_edge_defects_and_no_pinch() -> None:
         found = edge_defects(mesh.triangles)
         assert (found.open, found.crowded, found.misoriented) == (0, 0, 0)
         assert pinched_vertices(mesh.triangles) == 0
+
+
+def test_edges_and_fans_are_counted_on_any_order_of_the_triangles() -> None:
+    """Two tori and an octahedron that share single vertices: three fans at one vertex, two at another."""
+    parts = merged([torus(10.0, 3.0, 9, 7), torus(10.0, 3.0, 12, 8), octahedron()])
+    second, third = 9 * 7, 9 * 7 + 12 * 8
+    renamed = np.arange(len(parts.points), dtype=np.int32)
+    renamed[[second, third]], renamed[second + 5] = 0, 11
+    triangles = renamed[np.random.default_rng(3).permutation(parts.triangles)]
+    assert edge_defects(triangles) == EdgeDefects(0, 0, 0)
+    assert pinched_vertices(triangles) == 3
+    assert edge_defects(triangles[1:]) == EdgeDefects(3, 0, 0)
+    assert edge_defects(np.vstack([triangles, triangles[:1]])) == EdgeDefects(0, 3, 0)

@@ -9,6 +9,7 @@ from pipeline.geometry.validation_objects import BallInDish, BarOnPyramids
 from pipeline.kinematics.certificate import TORQUE_RADIUS_MM, equilibrium_residual
 from pipeline.kinematics.contact import Contacts, Pose
 from pipeline.kinematics.descent import MotionSettings, drop
+from pipeline.kinematics.ligaments import NO_LOAD, Load
 from tests.kinematics.shapes import falling
 
 EXACT = MotionSettings(tolerance_mm=1e-6)
@@ -97,3 +98,39 @@ def test_bar_at_rest_wherever_along_the_pyramids(along_mm: float) -> None:
     assert landed is not None
     assert landed.z == pytest.approx(-5.0, abs=1e-5)
     assert equilibrium_residual(pyramids.contacts(landed, 2e-3)) < 1e-6
+
+
+def sideways(pull: tuple[float, float], turn: float = 0.0, origin: tuple[float, float] = (0.0, 0.0)) -> Load:
+    """Fibres that pull with a force in the plane and a torque about the origin."""
+    return Load(1.0, -np.array([*pull, turn, 0.0]), origin)
+
+
+def test_a_slope_balances_the_fibre_that_holds_the_body_on_it() -> None:
+    """Along the slope the push pulls with its sine; a fibre that pulls back with the tangent leaves nothing."""
+    slope = contacts_of([1.0, 2.0, 3.0], tilted(0.4, np.pi))
+    assert equilibrium_residual(slope, sideways((np.tan(0.4), 0.0), 0.0, (1.0, 2.0))) == pytest.approx(0.0, abs=1e-12)
+    wrong_way = sideways((-np.tan(0.4), 0.0), 0.0, (1.0, 2.0))
+    assert equilibrium_residual(slope, wrong_way) == pytest.approx(2.0 * np.sin(0.4))
+    assert equilibrium_residual(slope, NO_LOAD) == equilibrium_residual(slope) == pytest.approx(np.sin(0.4))
+
+
+@pytest.mark.parametrize(("pull", "left"), [((0.0, 0.6), 0.6), ((0.3, -0.4), 0.5), ((0.0, 0.0), 0.0)])
+def test_a_flat_contact_cannot_hold_against_a_pull_aside(pull: tuple[float, float], left: float) -> None:
+    flat = contacts_of([4.0, -3.0, 0.0], [0.0, 0.0, -1.0])
+    assert equilibrium_residual(flat, sideways(pull, 0.0, (4.0, -3.0))) == pytest.approx(left, abs=1e-12)
+
+
+def test_torque_of_the_fibres_is_moved_to_where_the_contacts_are() -> None:
+    """A pull through the middle of two opposite walls, told about another point, is the same pull."""
+    walls = contacts_of([[1, 0, 0], [-1, 0, 0]], [tilted(0.4, np.pi), tilted(0.4)])
+    force, origin = np.array([0.1, 0.0]), np.array([7.0, 9.0])
+    turn = float(origin[1] * force[0] - origin[0] * force[1])  # (middle - origin) x force
+    assert equilibrium_residual(walls, sideways((0.1, 0.0), turn, (7.0, 9.0))) == pytest.approx(0.0, abs=1e-12)
+    assert equilibrium_residual(walls, sideways((0.1, 0.0), 0.0, (7.0, 9.0))) > 0.02
+
+
+def test_fibres_that_press_the_body_on_are_balanced_by_a_flat_contact() -> None:
+    flat = contacts_of([4.0, -3.0, 0.0], [0.0, 0.0, -1.0])
+    assert equilibrium_residual(flat, Load(1.0, np.array([0.0, 0.0, 0.0, -5.0]), (4.0, -3.0))) == pytest.approx(0.0)
+    held_off = Load(1.0, np.array([0.0, 0.0, 0.0, 1.5]), (4.0, -3.0))
+    assert equilibrium_residual(flat, held_off) == pytest.approx(0.5)

@@ -9,10 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.geometry.validation_objects import BallInDish, BarOnPyramids, box
-from pipeline.kinematics.contact import STEEPEST_COSINE, Contacts, Pose, reaction_rates, reaction_slack
+from pipeline.kinematics.contact import STEEPEST_COSINE, AttitudeContact, Contacts, Pose, reaction_rates, reaction_slack
 from pipeline.kinematics.descent import MotionSettings, drop
 from pipeline.kinematics.incremental import motion_options
 from pipeline.kinematics.joint_coordinates import attitude_rotation, rotation_z
+from pipeline.kinematics.ligaments import Fibres, fibre_load
 from tests.kinematics.shapes import at_attitude, convex, falling, groove
 
 Float = NDArray[np.float64]
@@ -39,17 +40,22 @@ def unit(*vector: float) -> Float:
     return np.asarray(np.asarray(vector) / np.linalg.norm(vector))
 
 
+def eccentric(normal: Float) -> Height:
+    """Sphere of radius 5 whose centre is 7 mm off the body's origin, on the plane normal . p = 0."""
+
+    def height(x: float, y: float, turn: float) -> float:
+        return float((5.0 - normal[0] * (x + 7.0 * np.cos(turn)) - normal[1] * (y + 7.0 * np.sin(turn))) / normal[2])
+
+    return height
+
+
 NORMALS = [unit(0.3, -0.2, -1.0), unit(-0.8, 0.5, -0.6), unit(0.0, 0.0, -1.0)]
 
 
 @pytest.mark.parametrize("normal", NORMALS)
 @pytest.mark.parametrize("theta", [0.0, 0.7, -2.0])
 def test_rates_of_an_eccentric_sphere_on_a_plane(normal: Float, theta: float) -> None:
-    """Sphere of radius 5 whose centre is 7 mm off the body's origin, on the plane normal . p = 0."""
-
-    def height(x: float, y: float, turn: float) -> float:
-        return float((5.0 - normal[0] * (x + 7.0 * np.cos(turn)) - normal[1] * (y + 7.0 * np.sin(turn))) / normal[2])
-
+    height = eccentric(normal)
     x, y = 1.5, -0.4
     centre = np.array([x + 7.0 * np.cos(theta), y + 7.0 * np.sin(theta), height(x, y, theta)])
     pose = Pose(x, y, height(x, y, theta), theta)
@@ -73,6 +79,51 @@ def test_rates_of_an_ellipsoid_on_a_plane(normal: Float, theta: float) -> None:
     lowest = np.asarray(pose[:3]) - spread(theta) / np.sqrt(normal @ spread(theta))
     found = reaction_rates(contacts_of([lowest], [normal], [0.0]), pose)[0]
     np.testing.assert_allclose(found, differences(height, (0.8, 2.0, theta)), atol=1e-6)
+
+
+@pytest.mark.parametrize("normal", NORMALS)
+@pytest.mark.parametrize("slack_mm", [2.0, 8.0, 100.0])
+def test_rates_and_slack_of_the_merit_with_a_fibre(normal: Float, slack_mm: float) -> None:
+    """The same sphere pulled by a fibre from its side: what its merit grows by, not its depth."""
+    ends = np.array([[4.0, -6.0, -3.0]]), np.array([[2.0, 3.0, 1.0]])
+    fibre = Fibres(*ends, np.array([slack_mm]), np.array([0.05]))
+    height = eccentric(normal)
+
+    def merit(x: float, y: float, turn: float) -> float:
+        z = height(x, y, turn)
+        return z - fibre_load(fibre, (x, y, turn, z)).energy_mm
+
+    at = (1.5, -0.4, 0.7)
+    pose = Pose(*at[:2], height(*at), at[2])
+    load = fibre_load(fibre, (*at, pose.z))
+    point = np.array([at[0] + 7.0 * np.cos(0.7), at[1] + 7.0 * np.sin(0.7), pose.z]) - 5.0 * normal
+    touching = contacts_of([point], [normal], [0.02])
+    np.testing.assert_allclose(reaction_rates(touching, pose, load)[0], differences(merit, at), atol=1e-7)
+    rise = 1e-4 * reaction_slack(touching, load)[0] / reaction_slack(touching)[0]
+    farther = fibre_load(fibre, (*at, pose.z + 1e-4)).energy_mm - load.energy_mm
+    assert rise == pytest.approx(1e-4 - farther, abs=1e-9)
+
+
+def test_without_a_taut_fibre_the_merit_is_the_depth() -> None:
+    slack = Fibres(np.zeros((1, 3)), np.zeros((1, 3)), np.array([50.0]), np.array([9.0]))
+    upright = falling(BarOnPyramids().pair())
+    for pair in (upright, AttitudeContact(upright.bodies, 0.3, 0.1, slack)):
+        assert pair.merit(Pose(1.0, 2.0, -7.25, 0.3)) == -7.25
+        assert pair.load(Pose(1.0, 2.0, -7.25, 0.3)).push == 1.0
+
+
+@pytest.mark.parametrize(("flexion", "varus"), [(0.4, 0.0), (-1.0, 0.3)])
+def test_fibres_turn_with_the_reference(flexion: float, varus: float) -> None:
+    """An attachment in the reference's frame is where that frame is at the attitude."""
+    fibre = Fibres(np.array([[9.0, -2.0, 4.0]]), np.array([[1.0, 0.5, -3.0]]), np.array([3.0]), np.array([0.2]))
+    turned = fibre._replace(on_reference=fibre.on_reference @ attitude_rotation(flexion, varus).T)
+    bodies, pose = falling(BarOnPyramids().pair()).bodies, Pose(0.3, -1.0, -6.0, 0.2)
+    here = AttitudeContact(bodies, 0.0, 0.0, fibre)
+    there = AttitudeContact(bodies, flexion, varus, turned)
+    assert here.merit(pose) < pose.z
+    assert there.merit(pose) == pytest.approx(here.merit(pose))
+    np.testing.assert_allclose(there.load(pose).slope, here.load(pose).slope, atol=1e-12)
+    assert AttitudeContact(bodies, flexion, varus, fibre).merit(pose) != pytest.approx(here.merit(pose), abs=0.01)
 
 
 @pytest.mark.parametrize(("u", "theta"), [(0.4, 0.1), (-0.7, 0.1), (0.9, -0.2), (-0.2, -0.15)])

@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.containment import nested
+from pipeline.geometry.mesh import TriangleMesh
 from pipeline.geometry.validation_objects import BallInDish, BarOnPyramids, ball, box, dish
 from pipeline.kinematics.certificate import equilibrium_residual
 from pipeline.kinematics.contact import AttitudeContact, Contacts, Pose
 from pipeline.kinematics.descent import drop
 from pipeline.kinematics.incremental import StablePose, solve_incremental
+from pipeline.kinematics.joint_coordinates import attitude_rotation, rotation_x
+from pipeline.kinematics.ligaments import CORD_STIFFNESS, Fibres
 from pipeline.kinematics.table import Status
 from tests.kinematics.settings import (
     BALL_STARTS,
@@ -24,7 +27,16 @@ from tests.kinematics.settings import (
     SMOOTH,
     with_steps,
 )
-from tests.kinematics.shapes import at_attitude, ellipsoid, falling, joined, shifted, turned_down
+from tests.kinematics.shapes import (
+    at_attitude,
+    convex,
+    ellipsoid,
+    falling,
+    groove,
+    joined,
+    shifted,
+    turned_down,
+)
 
 each_ball_start = pytest.mark.parametrize("start", BALL_STARTS)
 each_bar_start = pytest.mark.parametrize("start", BAR_STARTS)
@@ -228,3 +240,104 @@ def test_stable_pose_is_certified(pyramids: AttitudeContact, start: Pose) -> Non
     assert equilibrium_residual(pyramids.contacts(found, FINE_BAR.contact_band_mm)) < 1e-6
     assert not pyramids.touches(found)
     assert pyramids.touches(found._replace(z=found.z + FINE_BAR.motion.tolerance_mm))
+
+
+def pulled(pair: AttitudeContact, fibres: Fibres, angles_rad: tuple[float, float] = (0.0, 0.0)) -> AttitudeContact:
+    """The same bodies with fibres between them."""
+    return AttitudeContact(pair.bodies, *angles_rad, fibres)
+
+
+#: Forces on the ball at the end of its springs: from where, and how much per mm, as multiples of the push.
+PULLS = [((10.0, 4.0, -12.0), 0.05), ((6.0, 0.0, 5.0), 0.05), ((5.0, -2.0, -6.0), 0.3)]
+
+
+@pytest.mark.parametrize(("anchor", "stiffness"), PULLS)
+@each_ball_start
+def test_ball_pulled_aside_rests_where_slope_and_springs_balance(
+    bowl: AttitudeContact, start: Pose, anchor: tuple[float, float, float], stiffness: float
+) -> None:
+    """Springs of no length of their own pull in proportion to the distance; the middle of the ball moves on a sphere of
+    radius 6 about (0, 0, -12), and rests where push and springs together point away from that.
+
+    Two springs on either side keep the ball from turning. Away from its middle the dish has facets of a millimetre.
+    """
+    middle, sides = np.array([0.0, 0.0, -12.0]), np.array([[5.0, 0.0, 0.0], [-5.0, 0.0, 0.0]])
+    fibres = Fibres(np.asarray(anchor) + sides, sides, np.zeros(2), np.full(2, 0.5 * stiffness))
+    force = np.array([0.0, 0.0, 1.0]) + stiffness * (np.asarray(anchor) - middle)
+    rest = middle + 6.0 * force / np.linalg.norm(force)
+    loaded = pulled(bowl, fibres)
+    found = solve_incremental(loaded, start, FINE)
+    assert found.status is Status.OK
+    np.testing.assert_allclose(found.pose[:3], rest, atol=0.15)
+    assert np.hypot(*rest[:2]) > 0.9
+    assert abs(np.degrees(found.pose.theta)) < 0.05
+    contacts = loaded.contacts(found.pose, FINE.contact_band_mm)
+    assert equilibrium_residual(contacts, loaded.load(found.pose)) < 3e-3
+    assert equilibrium_residual(contacts) > 0.15
+
+
+SLOPE = float(np.radians(20.0))
+#: Down the groove that climbs by SLOPE, pushed along z.
+DOWNHILL = rotation_x(SLOPE) @ [0.0, 1.0, 0.0]
+#: Which way the tip's arm points when its fibre has turned it towards the anchor.
+TOWARDS = -0.5 * np.pi
+TIP_STARTS = [Pose(0.7, 3.0, -10.0, TOWARDS + 0.4), Pose(-1.0, -3.0, -10.0, TOWARDS - 0.5), Pose(0, 15, -10, TOWARDS)]
+each_tip_start = pytest.mark.parametrize("start", TIP_STARTS)
+
+
+def slide(angles_rad: tuple[float, float] = (0.0, 0.0)) -> AttitudeContact:
+    """A tip in a V-shaped groove: held sideways, sliding for ever along y, free to turn."""
+    trough, turn = groove(40.0), attitude_rotation(*angles_rad) @ rotation_x(SLOPE)
+    tip = convex([(0.0, 0.0, 0.0), (-3.0, -4.0, -20.0), (4.0, -4.0, -20.0), (0.5, 4.0, -20.0)])
+    return at_attitude(TriangleMesh(trough.points @ turn.T, trough.triangles), tip, *angles_rad)
+
+
+def strap(slack_part: float, stiffness: float | None = None) -> Fibres:
+    """A fibre from the tip's arm to the middle plane of the groove that balances the push at the origin.
+
+    Stretched from a part of its length there; from its whole length where a stiffness is given.
+    """
+    arm, anchor = np.array([2.0, 0.0, -8.0]), np.array([0.0, -15.0, 5.0])
+    way = anchor - [0.0, -2.0, -8.0]
+    length = float(np.linalg.norm(way))
+    tension = -DOWNHILL[2] * length / float(way @ DOWNHILL)
+    slack = slack_part * length if stiffness is None else length - tension / stiffness
+    return Fibres(anchor[None], arm[None], np.array([slack]), np.array([tension / (length - slack)]))
+
+
+@pytest.mark.parametrize("slack_part", [0.5, 0.9, 0.98])
+@each_tip_start
+def test_a_fibre_holds_the_tip_on_its_slide(start: Pose, slack_part: float) -> None:
+    loaded = pulled(slide(), strap(slack_part))
+    found = solve_incremental(loaded, start, FINE_BAR)
+    assert found.status is Status.OK
+    np.testing.assert_allclose(found.pose[:3], np.zeros(3), atol=0.02)
+    assert np.degrees(found.pose.theta - TOWARDS) == pytest.approx(0.0, abs=0.2)
+    contacts = loaded.contacts(found.pose, FINE_BAR.contact_band_mm)
+    assert equilibrium_residual(contacts, loaded.load(found.pose)) < 5e-3
+    assert equilibrium_residual(contacts) == pytest.approx(np.sin(SLOPE), abs=1e-6)
+
+
+@each_tip_start
+def test_a_cord_ends_the_slide(start: Pose) -> None:
+    found = solve_incremental(pulled(slide(), strap(0.0, CORD_STIFFNESS)), start, PAPER)
+    assert found.status is Status.OK
+    np.testing.assert_allclose(found.pose[:3], np.zeros(3), atol=0.02)
+
+
+def test_without_the_fibre_it_slides_off() -> None:
+    assert solve_incremental(slide(), TIP_STARTS[0], replace(PAPER, slide_bound_mm=12.0)).status is Status.SLID_OFF
+
+
+def test_the_strap_turns_with_the_reference() -> None:
+    """Reference and attachment turned with the attitude: the same stable pose."""
+    angles, fibres = (0.7, -0.2), strap(0.9)
+    turned = fibres._replace(on_reference=fibres.on_reference @ attitude_rotation(*angles).T)
+    found = solve_incremental(pulled(slide(angles), turned, angles), TIP_STARTS[0], FINE_BAR)
+    np.testing.assert_allclose(found.pose[:3], np.zeros(3), atol=0.02)
+
+
+@each_bar_start
+def test_slack_fibres_change_nothing(pyramids: AttitudeContact, start: Pose) -> None:
+    slack = Fibres(np.zeros((2, 3)), np.ones((2, 3)), np.array([200.0, 300.0]), np.array([5.0, 1.0]))
+    assert solve_incremental(pulled(pyramids, slack), start, PAPER) == solve_incremental(pyramids, start, PAPER)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.polynomial import chebyshev, polynomial
 
-from pipeline.kinematics.cell import ProofSettings
+from pipeline.kinematics.cell import NO_CERTIFICATE, Claim, prove
 from pipeline.kinematics.contact import Pose
-from pipeline.kinematics.descent import MotionSettings
+from pipeline.kinematics.direct.solver import DirectSolver
 from pipeline.kinematics.smoothing import (
     HUBER_BOUND,
     Entry,
@@ -23,7 +23,7 @@ from pipeline.kinematics.smoothing import (
     way_to_contact,
 )
 from pipeline.kinematics.table import Float, Grid, PoseTable, RawTable, Status
-from tests.kinematics.hollow_joint import FACETS_MM, REST_MM, hollow_pair
+from tests.kinematics.hollow_joint import FACETS_MM, PROOF, REST_MM, direct, hollow_pair
 
 GRID = Grid(np.linspace(0.0, 120.0, 13), np.linspace(-4.0, 4.0, 5))
 BAD = np.uint8(Status.SLID_OFF)
@@ -39,7 +39,7 @@ def raw_table(grid: Grid, values: tuple[Float, Float, Float], z_mm: Float | None
         status=np.zeros(grid.shape, dtype=np.uint8), equilibrium_residual=zeros, medial_gap_mm=zeros,
         lateral_gap_mm=zeros, contact_count=counts,
     )  # fmt: skip
-    return RawTable(grid, poses, counts, zeros, zeros, zeros, zeros)
+    return RawTable(grid, poses, counts, *7 * (zeros,))
 
 
 def flagged(raw: RawTable, cells: list[tuple[int, int]], hidden: float = np.nan) -> RawTable:
@@ -222,34 +222,49 @@ def test_contact_is_looked_for_from_the_raw_depth_or_the_least_of_the_column() -
 # --- contact
 
 
+@pytest.fixture(scope="module")
+def solver() -> DirectSolver:
+    return direct()
+
+
 @pytest.mark.parametrize("start_z", [REST_MM - 2.0, REST_MM + 0.3])
-def test_an_entry_settles_at_contact_from_before_and_from_beyond(start_z: float) -> None:
+def test_an_entry_settles_at_contact_from_before_and_from_beyond(solver: DirectSolver, start_z: float) -> None:
     x, y = 1.5, -0.8
     entry = Entry(0, 0, 20.0, 3.0, Pose(x, y, start_z, 0.4), Status.SMOOTHED)
-    cell = settle(hollow_pair().bodies(), entry, MotionSettings(), ProofSettings())
-    assert (cell.pose.x, cell.pose.y, cell.pose.theta) == (x, y, 0.4)
-    assert cell.pose.z == pytest.approx(np.sqrt(REST_MM**2 - x**2 - y**2), abs=FACETS_MM)
-    assert (cell.status, cell.gap_before_mm) == (Status.SMOOTHED, 0.0)
-    assert cell.gap_after_mm <= 2e-4
+    settled = settle(solver, entry)
+    assert settled.entry == entry
+    assert settled.pose is not None
+    assert (settled.pose.x, settled.pose.y, settled.pose.theta) == (x, y, 0.4)
+    assert settled.pose.z == pytest.approx(np.sqrt(REST_MM**2 - x**2 - y**2), abs=FACETS_MM)
 
 
-def test_entries_that_cannot_be_shown_stay_so() -> None:
-    bodies = hollow_pair().bodies()
+def test_a_settled_entry_is_proven_on_both_sides_by_the_collision_library(solver: DirectSolver) -> None:
+    entry = Entry(0, 0, 20.0, 3.0, Pose(1.5, -0.8, 0.0, 0.4), Status.OK)
+    settled = settle(solver, entry)
+    assert settled.pose is not None
+    assert settled.certificate.contact_count > 0
+    claim = Claim((np.radians(20.0), np.radians(3.0)), settled.pose, settled.certificate)
+    proof = prove(hollow_pair().bodies(), claim, PROOF.ladder_mm)
+    assert proof.gap_before_mm == 0.0
+    assert proof.gap_after_mm <= 2e-4
+
+
+def test_entries_that_cannot_be_shown_stay_so(solver: DirectSolver) -> None:
     failed = Entry(0, 0, 20.0, 3.0, Pose(0.0, 0.0, 0.0, 0.0), Status.NOT_CONVERGED)
-    assert settle(bodies, failed, MotionSettings(), ProofSettings()).status is Status.NOT_CONVERGED
+    assert settle(solver, failed) == (failed, None, NO_CERTIFICATE)
     beside = Entry(0, 0, 20.0, 3.0, Pose(40.0, 0.0, 0.0, 0.0), Status.OK)
-    cell = settle(bodies, beside, MotionSettings(), ProofSettings())
-    assert cell.status is Status.NO_CONTACT
-    assert np.isnan(cell.pose.z)
+    assert settle(solver, beside) == (beside, None, NO_CERTIFICATE)
 
 
 @pytest.mark.parametrize("way_mm", [-0.2, 0.0, 0.35])
-def test_the_way_to_contact_is_positive_for_a_gap_and_negative_for_an_intersection(way_mm: float) -> None:
-    bodies, motion = hollow_pair().bodies(), MotionSettings(tolerance_mm=1e-5)
-    at_contact = settle(bodies, Entry(0, 0, 10.0, 0.0, Pose(0, 0, 5.0, 0), Status.OK), motion, ProofSettings()).pose
+def test_the_way_to_contact_is_positive_for_a_gap_and_negative_for_an_intersection(
+    solver: DirectSolver, way_mm: float
+) -> None:
+    at_contact = settle(solver, Entry(0, 0, 10.0, 0.0, Pose(0, 0, 5.0, 0), Status.OK)).pose
+    assert at_contact is not None
     probe = Probe(10.0, 0.0, at_contact._replace(z=at_contact.z - way_mm))
-    assert way_to_contact(bodies, probe, motion) == pytest.approx(way_mm, abs=2e-5)
+    assert way_to_contact(solver, probe) == pytest.approx(way_mm, abs=1e-9)
 
 
-def test_no_contact_has_no_way() -> None:
-    assert np.isnan(way_to_contact(hollow_pair().bodies(), Probe(0.0, 0.0, Pose(60.0, 0, 0, 0)), MotionSettings()))
+def test_no_contact_has_no_way(solver: DirectSolver) -> None:
+    assert np.isnan(way_to_contact(solver, Probe(0.0, 0.0, Pose(60.0, 0, 0, 0))))

@@ -12,11 +12,13 @@ from pipeline.artifacts import (
     MESH_QUALITY,
     MESHES,
     MOVING_BODY,
+    NEUTRAL_CURVE,
     RAW_TABLE,
     REFERENCE_BODY,
     SCAN_RETURNS,
     SMOOTH_TABLE,
     SURFACE_ORIGINS,
+    SWEEP_FACTS,
 )
 from pipeline.engine.artifacts import Artifact
 from pipeline.engine.stage import findings_of
@@ -39,9 +41,8 @@ class MemoryReads:
 class MemoryOutputs:
     """Encoded artifacts by name."""
 
-    jobs = 1
-
-    def __init__(self) -> None:
+    def __init__(self, jobs: int = 1) -> None:
+        self.jobs = jobs
         self.files: dict[str, Mapping[str, bytes]] = {}
         self.steps: list[tuple[int, int]] = []
 
@@ -70,6 +71,8 @@ def reads_of(evidence: Evidence) -> MemoryReads:
         SURFACE_ORIGINS.name: evidence.origins,
         RAW_TABLE.name: evidence.raw,
         SCAN_RETURNS.name: evidence.scan_returns,
+        SWEEP_FACTS.name: evidence.sweep,
+        NEUTRAL_CURVE.name: evidence.neutral,
         SMOOTH_TABLE.name: evidence.smooth,
     }
     return MemoryReads(values | {findings_of(name).name: found for name, found in evidence.findings.items()})

@@ -14,17 +14,21 @@ from numpy.typing import NDArray
 from pipeline.engine.stage import Finding, Findings, Severity
 from pipeline.geometry.mesh import TriangleMesh, merged, transformed
 from pipeline.geometry.volume import LabelVolume
+from pipeline.kinematics.neutral import NeutralCurve
 from pipeline.kinematics.table import CurveFit, Grid, PoseTable, RawTable, SmoothTable, Status
 from pipeline.records import (
     Anatomy,
     AxisEstimate,
     CaseFacts,
+    CrossCheck,
+    JumpCount,
     Landmark,
     Matrix,
     MeshQuality,
     ScanReturn,
     Side,
     SurfaceOrigin,
+    SweepFacts,
 )
 from pipeline.report.evidence import Evidence
 
@@ -33,6 +37,16 @@ Float = NDArray[np.float64]
 SPACING_MM = 2.0
 CONDYLE_MM = 20.0
 RETURNS = (ScanReturn(0.0, 0.0, 0.0, True, 0.02, 0.04, -0.1), ScanReturn(2.0, 0.0, 0.0, True, 0.05, 0.02, -0.1))
+SWEEP = SweepFacts(
+    solver="direct",
+    push_n=0.0,
+    reference_strain=0.0,
+    jumps_before=JumpCount(5, 1.9, 4.0),
+    jumps_after=JumpCount(2, 1.2, 3.5),
+    cross_check=CrossCheck(
+        cells=20, agreeing=19, shallower=1, shift_mm=0.3, rotation_deg=0.7, deeper_mm=0.05, shallower_mm=0.02
+    ),
+)
 STAGES = ("intake", "mesh", "anatomy", "contact", "sweep", "smooth")
 
 
@@ -53,6 +67,8 @@ def sample_evidence(side: Side = "right", case_id: str = "SAMPLE-1") -> Evidence
         origins=_origins(),
         raw=_raw(grid, fitted),
         scan_returns=RETURNS,
+        sweep=SWEEP,
+        neutral=_neutral(grid),
         smooth=_smooth(grid, fitted),
         findings={name: _findings(name) for name in STAGES},
     )
@@ -75,6 +91,7 @@ def only_one_attitude(evidence: Evidence) -> Evidence:
         mesh_quality=(),
         anatomy=replace(evidence.anatomy, landmarks=(), axes=(), side_evidence=()),
         raw=_raw(grid, fitted),
+        neutral=_neutral(grid),
         smooth=_smooth(grid, fitted),
     )
 
@@ -248,6 +265,25 @@ def _raw(grid: Grid, fitted: PoseTable) -> RawTable:
         gap_after_mm=np.full(shape, 0.01),
         hysteresis_mm=np.full(shape, 0.2),
         hysteresis_deg=np.full(shape, 0.3),
+        margin_lateral_mm=np.full(shape, 4.0),
+        margin_anterior_mm=np.full(shape, 3.0),
+        margin_rotation_deg=np.full(shape, 8.0),
+    )
+
+
+def _neutral(grid: Grid) -> NeutralCurve:
+    """The knee stands straight, both compartments in contact."""
+    along = np.radians(grid.flexion_deg)
+    zeros = np.zeros_like(along)
+    return NeutralCurve(
+        flexion_deg=grid.flexion_deg,
+        varus_deg=zeros,
+        lateral_mm=0.8 * np.sin(along),
+        anterior_mm=-3.0 * np.sin(along / 2.0),
+        proximal_mm=-CONDYLE_MM - 0.3 * np.sin(along),
+        internal_rotation_deg=8.0 * np.sin(along),
+        uneven_mm=zeros,
+        status=np.zeros(len(along), dtype=np.uint8),
     )
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.mesh import TriangleMesh
-from pipeline.kinematics.table import PoseTable, SmoothTable, Status
-from pipeline.records import Metric
+from pipeline.kinematics.table import SmoothTable, Status
+from pipeline.records import CrossCheck, JumpCount, Metric
 from pipeline.report.evidence import Evidence
-from pipeline.report.metrics import all_metrics, jumps, open_edges, untested
+from pipeline.report.metrics import all_metrics, open_edges, untested
 from pipeline.report.settings import Limits
 from pipeline.report.verdict import guarantees
 from tests.report.sample import revolved, sample_evidence, with_status
@@ -124,25 +124,52 @@ def test_open_edges(triangles: np.ndarray, edges: int) -> None:
     assert open_edges(TriangleMesh(CUBE_LIKE.points, triangles.astype(np.int32))) == edges
 
 
-def poses(**changes: np.ndarray) -> PoseTable:
-    """The sample's smoothed poses with some arrays replaced."""
-    return replace(sample_evidence().smooth.poses, **changes)
+def with_sweep(**changes: Any) -> Evidence:
+    """The sample with other facts of its sweep."""
+    evidence = sample_evidence()
+    return replace(evidence, sweep=replace(evidence.sweep, **changes))
 
 
-def test_one_displaced_pose_makes_four_steps() -> None:
-    fitted = sample_evidence().smooth.poses
-    lateral = fitted.lateral_mm.copy()
-    lateral[4, 1] += 2.0
-    shift, turn = jumps(poses(lateral_mm=lateral), fitted)
-    assert np.sort(shift)[-4:] == pytest.approx(2.0)
-    assert np.sort(shift)[:-4] == pytest.approx(0.0)
-    assert turn == pytest.approx(0.0)
+def test_jumps_are_those_that_the_sweep_counted() -> None:
+    metrics = measured(with_sweep(jumps_before=JumpCount(7, 2.5, 9.0), jumps_after=JumpCount(3, 1.5, 4.5)))
+    values = {name: metrics[name].value for name in ("jumps_before", "jumps_after", "jump_mm", "jump_deg")}
+    assert values == {"jumps_before": 7.0, "jumps_after": 3.0, "jump_mm": 1.5, "jump_deg": 4.5}
 
 
-def test_the_motion_itself_is_no_jump() -> None:
-    shift, turn = jumps(sample_evidence().smooth.poses, sample_evidence().smooth.poses)
-    assert not shift.any()
-    assert not turn.any()
+def test_hysteresis_is_the_largest_that_is_known() -> None:
+    evidence = sample_evidence()
+    known = np.full(evidence.raw.grid.shape, np.nan)
+    known[3, 1], known[4, 1] = 0.4, 1.3
+    raw = replace(evidence.raw, hysteresis_mm=known, hysteresis_deg=np.full_like(known, np.nan))
+    metrics = measured(replace(evidence, raw=raw))
+    assert metrics["hysteresis_mm"].value == 1.3
+    assert "hysteresis_deg" not in metrics
+
+
+def test_margins_are_medians_where_the_solver_knows_them() -> None:
+    evidence = sample_evidence()
+    lateral = np.full(evidence.raw.grid.shape, np.nan)
+    lateral[:2] = [[5.0, 2.0, 1.0], [np.nan, 2.0, 5.0]]
+    raw = replace(evidence.raw, margin_lateral_mm=lateral, margin_rotation_deg=np.full_like(lateral, np.nan))
+    metrics = measured(replace(evidence, raw=raw))
+    assert (metrics["margin_lateral"].value, metrics["margin_lateral"].unit) == (2.0, "mm")
+    assert metrics["margin_anterior"].value == 3.0
+    assert "margin_rotation" not in metrics
+
+
+def test_the_cross_check_says_how_many_agree_and_how_far_apart_the_others_are() -> None:
+    check = CrossCheck(40, 36, 3, shift_mm=1.1, rotation_deg=2.2, deeper_mm=0.5, shallower_mm=0.06)
+    metrics = measured(with_sweep(cross_check=check))
+    assert metrics["cross_check_agreeing"].value == pytest.approx(90.0)
+    assert "40 attitudes" in metrics["cross_check_agreeing"].meaning
+    assert (metrics["cross_check_mm"].value, metrics["cross_check_deg"].value) == (1.1, 2.2)
+    assert metrics["cross_check_shallower"].value == 0.06
+    assert "3 attitudes" in metrics["cross_check_shallower"].meaning
+
+
+def test_without_a_cross_check_nothing_is_said_of_it() -> None:
+    metrics = measured(with_sweep(cross_check=CrossCheck(0, 0, 0, 0.0, 0.0, 0.0, 0.0)))
+    assert not [name for name in metrics if name.startswith("cross_check")]
 
 
 def test_the_scan_pose_counts_the_worst_release_and_the_lost_ones() -> None:

@@ -40,7 +40,7 @@ def placed(lps_from_index: Any = LPS_FROM_INDEX) -> Anatomy:
     return anatomy(frame, frame, (0.0,) * 6)
 
 
-def contact(values: NDArray[np.uint8], params: Params = PARAMS, **changes: Any) -> tuple[Run, Findings]:
+def contact(values: NDArray[np.uint8], params: Params = PARAMS, jobs: int = 1, **changes: Any) -> tuple[Run, Findings]:
     run = Run(
         STAGE,
         {
@@ -49,6 +49,7 @@ def contact(values: NDArray[np.uint8], params: Params = PARAMS, **changes: Any) 
             ANATOMY.name: placed(),
             MESHES.name: {},
         },
+        jobs,
     )
     return run, run.go(params)
 
@@ -65,6 +66,14 @@ def test_both_bodies_are_closed_outward_and_as_large_as_their_labels(made: tuple
         check_closed(mesh, artifact.name)
         assert len(mesh.triangles) <= 2000
         assert volume_mm3(mesh) == pytest.approx(np.isin(joint_labels(), labels).sum(), rel=0.04)
+
+
+def test_two_jobs_give_the_same_bytes(made: tuple[Run, Findings]) -> None:
+    run, findings = contact(joint_labels(), jobs=2)
+    assert findings == made[1]
+    for artifact in (REFERENCE_BODY, MOVING_BODY):
+        for name in ("points", "triangles"):
+            assert getattr(run[artifact], name).tobytes() == getattr(made[0][artifact], name).tobytes()
 
 
 def test_cartilage_and_bone_are_one_surface_in_scan_space(made: tuple[Run, Findings]) -> None:

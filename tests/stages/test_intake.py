@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from pipeline.artifacts import CASE_FACTS, GIVEN_MESHES, LABELS
+from pipeline.artifacts import CASE_FACTS, GIVEN_MESHES, LABELS, LIGAMENTS
 from pipeline.engine.artifacts import SOURCE, Artifact, SourceFolder
 from pipeline.engine.stage import Finding, Severity
 from pipeline.errors import CaseRejected
@@ -20,7 +20,7 @@ from pipeline.files.meshes import encode_ply, encode_stl
 from pipeline.files.strict_yaml import parse_yaml
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.geometry.volume import LabelVolume
-from pipeline.records import CaseFacts
+from pipeline.records import CaseFacts, LigamentFibre
 from pipeline.stages.intake import STAGE, Params
 from tests.files.label_samples import knee_like, nifti_bytes, nrrd_bytes, restored, segment_keys
 
@@ -119,6 +119,7 @@ def test_the_canonical_case(tmp_path: Path) -> None:
     np.testing.assert_allclose(facts.spacing_mm, (1.0, 1.5, 2.0))
     assert volume.values.dtype == np.uint8
     assert result.out.decoded(GIVEN_MESHES) == {}
+    assert result.out.decoded(LIGAMENTS) == ()
     np.testing.assert_allclose(facts.clipped_mm2["femur"], 16 * 12 * 1.0 * 1.5)
     assert facts.clipped_mm2["femoral_cartilage"] == 0.0
     assert result.codes(Severity.NOTE) == ["N-LBL-01", "N-FOV-01", "N-FOV-01"]
@@ -281,6 +282,28 @@ def test_landmarks_are_taken_along(tmp_path: Path) -> None:
     assert sorted(result.facts.source_files) == ["labels.nrrd", "landmarks.mrk.json"]
 
 
+LIGAMENT_TABLE = """name,reference_x,reference_y,reference_z,moving_x,moving_y,moving_z,slack_mm,kind
+ACL,1,2,3,4,5,-30,,
+PCL,5,10,0.1,6,12,-30,31.5,cord
+"""
+
+
+def test_ligaments_are_taken_along(tmp_path: Path) -> None:
+    (tmp_path / "ligaments.csv").write_text(LIGAMENT_TABLE)
+    result = run_on(tmp_path, knee_like())
+    assert result.out.decoded(LIGAMENTS) == (
+        LigamentFibre("ACL", (1.0, 2.0, 3.0), (4.0, 5.0, -30.0), None, 500.0),
+        LigamentFibre("PCL", (5.0, 10.0, 0.1), (6.0, 12.0, -30.0), 31.5, None),
+    )
+    assert sorted(result.facts.source_files) == ["labels.nrrd", "ligaments.csv"]
+
+
+def test_ligaments_that_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "ligaments.csv").write_text(LIGAMENT_TABLE.replace("31.5", "long"))
+    with refused("E-LIG-02", r"Line 3 of ligaments\.csv is not a fibre: slack_mm is 'long'"):
+        run_on(tmp_path, knee_like())
+
+
 def tetrahedron() -> TriangleMesh:
     points = np.array([[0.0, 0, 0], [30, 0, 0], [0, 30, 0], [0, 0, 30]])
     return TriangleMesh(points, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32))
@@ -291,10 +314,12 @@ def test_a_case_of_meshes(tmp_path: Path) -> None:
     (tmp_path / "meshes/femur.ply").write_bytes(encode_ply(tetrahedron()))
     (tmp_path / "meshes/tibia.stl").write_bytes(encode_stl(tetrahedron()))
     (tmp_path / "meshes/screw.stl").write_bytes(b"never read")
+    (tmp_path / "ligaments.csv").write_text(LIGAMENT_TABLE)
     result = Result(tmp_path, PARAMS)
     assert result.out.decoded(LABELS) is None
     meshes = result.out.decoded(GIVEN_MESHES)
     assert list(meshes) == ["femur", "tibia"]
+    assert [fibre.name for fibre in result.out.decoded(LIGAMENTS)] == ["ACL", "PCL"]
     np.testing.assert_array_equal(meshes["femur"].points, tetrahedron().points)
     assert (result.facts.source, result.facts.structures) == ("meshes", {"femur": 0, "tibia": 0})
     assert [finding.message for finding in result.findings] == [

@@ -26,9 +26,9 @@ DATA = Path(__file__).resolve().parents[2].parent / "shared/data/knee_mr_a/label
 
 
 class _Out(dict[Any, Any]):
-    jobs = 1
-
-    def __init__(self) -> None:
+    def __init__(self, jobs: int) -> None:
+        super().__init__()
+        self.jobs = jobs
         self.steps: list[tuple[int, int]] = []
 
     def progress(self, done: int, total: int) -> None:
@@ -54,10 +54,11 @@ def _run(
     params: Params = SMALL,
     side: Side = "right",
     matrix: NDArray[np.float64] | None = None,
+    jobs: int = 1,
 ) -> tuple[_Out, Findings]:
     structures = {"femur": 2, "tibia": 1, **({} if values is None or values.max() < 3 else {"men": 3})}
     volume = None if values is None else LabelVolume(values, np.eye(4) if matrix is None else matrix)
-    out = _Out()
+    out = _Out(jobs)
     reads: Any = {CASE_FACTS: _facts(structures, side), LABELS: volume, GIVEN_MESHES: given or {}}
     findings = STAGE.run(reads, params, out)
     return out, findings
@@ -74,6 +75,16 @@ def test_every_structure_becomes_a_closed_mesh_with_its_quality() -> None:
         assert 0.0 < quality.deviation_rms_mm < quality.deviation_max_mm < 1.0
     assert findings == ()
     assert out.steps == [(0, 2), (1, 2), (2, 2)]
+
+
+def test_two_jobs_give_the_same_bytes() -> None:
+    (one, findings), (two, same) = (_run(_two_balls(), jobs=jobs) for jobs in (1, 2))
+    assert findings == same
+    assert two[MESH_QUALITY] == one[MESH_QUALITY]
+    assert two.steps == one.steps
+    for name, mesh in one[MESHES].items():
+        assert two[MESHES][name].points.tobytes() == mesh.points.tobytes()
+        assert two[MESHES][name].triangles.tobytes() == mesh.triangles.tobytes()
 
 
 def test_a_left_joint_gives_the_exact_mirror_image_of_the_right_one() -> None:

@@ -19,6 +19,7 @@ from pipeline.artifacts import (
     CASE_FACTS,
     MESHES,
     MOVING_BODY,
+    NEUTRAL_CURVE,
     PACKAGE,
     RAW_TABLE,
     REFERENCE_BODY,
@@ -91,6 +92,7 @@ def reads(side: Side = "right") -> Reads:
             MOVING_BODY.name: table.moving_body,
             SURFACE_ORIGINS.name: origins,
             RAW_TABLE.name: table.raw,
+            NEUTRAL_CURVE.name: table.neutral,
             SMOOTH_TABLE.name: table.smooth,
             VERDICT.name: Verdict("REVIEW", ("Only 63 mm of tibia in the scan.",), ()),
             REPORT.name: {"report.html": b"<html></html>", "images/poses.png": b"\x89PNG"},
@@ -187,6 +189,8 @@ def test_the_table_is_that_of_the_stages_before(side: Side) -> None:
     assert (read.side, read.joint) == (side, "knee")
     assert re.fullmatch(r"ct2lut \d+\.\d+\.\d+", read.software)
     np.testing.assert_array_equal(read.smooth.poses.lateral_mm, expected.smooth.poses.lateral_mm)
+    np.testing.assert_array_equal(read.raw.margin_lateral_mm, expected.raw.margin_lateral_mm)
+    np.testing.assert_array_equal(read.neutral.varus_deg, expected.neutral.varus_deg)
     np.testing.assert_array_equal(read.scan_from_moving, expected.scan_from_moving)
     np.testing.assert_array_equal(read.moving_body.points, expected.moving_body.points)
 

@@ -5,16 +5,21 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from pipeline.adapters import rendering
+from pipeline.adapters.workers import map_in_order
 from pipeline.artifacts import REPORT, VERDICT
 from pipeline.engine.stage import Findings, Severity
+from pipeline.errors import EnvironmentFault
 from pipeline.kinematics.table import Status
 from pipeline.report import figures
 from pipeline.report.settings import Limits, PictureSettings
 from pipeline.stages.qa import STAGE, Params
+from tests.adapters.worker_tasks import die
 from tests.report.memory import MemoryOutputs, reads_of
 from tests.report.sample import only_one_attitude, sample_evidence, with_status
 
@@ -52,6 +57,21 @@ def test_a_second_run_gives_the_same_bytes(sound: tuple[Findings, MemoryOutputs]
     assert out.files == sound[1].files
 
 
+def test_two_jobs_give_the_same_bytes(sound: tuple[Findings, MemoryOutputs]) -> None:
+    out = MemoryOutputs(jobs=2)
+    STAGE.run(reads_of(sample_evidence()), SMALL, out)
+    assert out.files == sound[1].files
+    assert out.steps == sound[1].steps
+
+
+def test_a_worker_that_the_renderer_ends_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    rendering.require_renderer.cache_clear()
+    monkeypatch.setattr("pipeline.stages.qa.map_in_order", lambda _, *rest: map_in_order(die, *rest))
+    monkeypatch.setattr(rendering, "_PROBE", "import os; os.abort()")
+    with pytest.raises(EnvironmentFault, match="E-ENV-10"):
+        STAGE.run(reads_of(sample_evidence()), SMALL, MemoryOutputs(jobs=2))
+
+
 def test_a_broken_guarantee_is_a_review_finding_of_its_number() -> None:
     evidence = with_status(sample_evidence(), (9, 1), Status.SLID_OFF)
     contact = np.where(np.arange(39).reshape(13, 3) == 7, 0.05, evidence.smooth.contact_error_mm)
@@ -69,12 +89,11 @@ def test_a_picture_that_cannot_be_drawn_is_missed(monkeypatch: pytest.MonkeyPatc
     def refuse(*_: object) -> bytes:
         raise ValueError("nothing to see")
 
-    fine = figures.Drawn(figures.CURVES, b"\x89PNG")
+    def draw(figure: figures.Figure, **rest: Any) -> figures.Drawn:
+        return figures.drawn(figure, **rest) if figure.name == "slices" else figures.Drawn(figure, b"\x89PNG")
+
     monkeypatch.setattr(figures, "SLICES", replace(figures.SLICES, draw=refuse))
-    monkeypatch.setattr(
-        "pipeline.stages.qa.drawn",
-        lambda figure, *rest: figures.drawn(figure, *rest) if figure.name == "slices" else replace(fine, figure=figure),
-    )
+    monkeypatch.setattr("pipeline.stages.qa.drawn", draw)
     out = MemoryOutputs()
     (finding,) = STAGE.run(reads_of(sample_evidence()), SMALL, out)
     assert finding.code == "W-QA-10"

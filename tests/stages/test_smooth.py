@@ -8,16 +8,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.artifacts import ANATOMY, MOVING_BODY, RAW_TABLE, REFERENCE_BODY, SMOOTH_TABLE
+from pipeline.artifacts import (
+    ANATOMY,
+    LIGAMENTS,
+    MOVING_BODY,
+    RAW_TABLE,
+    REFERENCE_BODY,
+    SMOOTH_TABLE,
+    SWEEP_FACTS,
+)
 from pipeline.engine.stage import Findings, Severity
 from pipeline.errors import CaseRejected
-from pipeline.kinematics.cell import Cell, ProofSettings, measured_cell
-from pipeline.kinematics.contact import AttitudeContact, Bodies
-from pipeline.kinematics.descent import MotionSettings
-from pipeline.kinematics.smoothing import Entry, settle
+from pipeline.kinematics.smoothing import Entry, Settled, settle
+from pipeline.kinematics.solvers import ExactSolver
 from pipeline.kinematics.table import Float, Grid, PoseTable, RawTable, Status
+from pipeline.records import LigamentFibre
 from pipeline.stages.smooth import STAGE, Params
 from tests.kinematics.hollow_joint import FACETS_MM, REST_MM, ball, hollow
+from tests.report.sample import SWEEP
 from tests.stages.in_memory import Run, anatomy
 
 GRID = Grid(np.linspace(0.0, 40.0, 9), np.array([-2.0, 0.0, 2.0]))
@@ -40,17 +48,22 @@ def raw_table(grid: Grid, failed: list[tuple[int, int]], offset_mm: float = 0.0)
         x[cell] = y[cell] = z[cell] = rotation[cell] = np.nan
     counts = np.zeros(grid.shape, dtype=np.int32)
     poses = PoseTable(x, y, z, rotation, status, zeros, zeros, zeros, counts)
-    return RawTable(grid, poses, counts, zeros, zeros, zeros, zeros)
+    return RawTable(grid, poses, counts, *7 * (zeros,))
 
 
-def smoothed(raw: RawTable, params: Params = PARAMS) -> tuple[Run, Findings]:
-    given: dict[str, Any] = {
+def inputs(raw: RawTable) -> dict[str, Any]:
+    return {
         REFERENCE_BODY.name: hollow(),
         MOVING_BODY.name: ball(),
         ANATOMY.name: anatomy(np.eye(4), np.eye(4), (0.0,) * 6),
+        LIGAMENTS.name: (),
         RAW_TABLE.name: raw,
+        SWEEP_FACTS.name: SWEEP,
     }
-    run = Run(STAGE, given)
+
+
+def smoothed(raw: RawTable, params: Params = PARAMS, jobs: int = 1) -> tuple[Run, Findings]:
+    run = Run(STAGE, inputs(raw), jobs)
     return run, run.go(params)
 
 
@@ -147,11 +160,41 @@ def test_a_table_that_was_jumping_is_in_contact_all_the_same() -> None:
 
 
 def test_an_entry_that_has_to_be_pulled_back_has_a_negative_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    def too_deep(bodies: Bodies, entry: Entry, motion: MotionSettings, proof: ProofSettings) -> Cell:
-        pose = settle(bodies, entry, motion, proof).pose
-        contact = AttitudeContact(bodies, np.radians(entry.flexion_deg), np.radians(entry.varus_deg))
-        return measured_cell(contact, pose._replace(z=pose.z + 3e-3), entry.status, proof)
+    """The proof is that of the collision library, whatever the solver holds to be contact."""
 
-    monkeypatch.setattr("pipeline.stages.smooth.settle", too_deep)
+    def too_deep(solver: ExactSolver, entry: Entry) -> Settled:
+        settled = settle(solver, entry)
+        assert settled.pose is not None
+        return settled._replace(pose=settled.pose._replace(z=settled.pose.z + 3e-3))
+
+    monkeypatch.setattr("pipeline.adapters.joint_work.settle", too_deep)
     table = smoothed(raw_table(Grid(np.array([0.0]), np.array([0.0])), []))[0][SMOOTH_TABLE]
     assert table.contact_error_mm[0, 0] == -5e-3
+
+
+def test_an_entry_that_meets_nothing_is_not_shown() -> None:
+    """The curves lead one entry 40 mm aside, past the rim of the bowl."""
+    grid = Grid(np.array([0.0, 20.0, 40.0]), np.array([0.0]))
+    raw = raw_table(grid, [])
+    aside = replace(raw.poses, lateral_mm=np.array([[0.0], [0.0], [40.0]]))
+    table = smoothed(replace(raw, poses=aside))[0][SMOOTH_TABLE]
+    np.testing.assert_array_equal(table.poses.status, [[Status.OK], [Status.OK], [Status.NO_CONTACT]])
+    np.testing.assert_array_equal(np.isnan(table.contact_error_mm), [[False], [False], [True]])
+
+
+@pytest.mark.parametrize(("push_n", "left_over"), [(8.0, 0.0), (0.0, 2.62 / REST_MM)])
+def test_ligaments_that_pulled_in_the_sweep_are_in_the_balance(push_n: float, left_over: float) -> None:
+    """Against 8 N this spring holds the ball 2.62 mm aside, where else the slope of the wall would be left over."""
+    fibre = LigamentFibre("spring", (40.0, 0.0, 0.0), (0.0, 0.0, 0.0), slack_mm=1.0, stiffness_n=0.1)
+    raw = raw_table(Grid(np.array([0.0]), np.array([0.0])), [])
+    aside = replace(raw.poses, lateral_mm=np.array([[2.62]]), anterior_mm=np.zeros((1, 1)))
+    run = Run(STAGE, {**inputs(replace(raw, poses=aside)), LIGAMENTS.name: (fibre,)})
+    run.given[SWEEP_FACTS.name] = replace(SWEEP, push_n=push_n)
+    run.go(PARAMS.model_copy(update={"contact_band_mm": 0.005}))
+    assert run[SMOOTH_TABLE].poses.equilibrium_residual[0, 0] == pytest.approx(left_over, abs=0.06)
+
+
+def test_two_jobs_give_the_same_bytes(made: tuple[Run, Findings]) -> None:
+    run, findings = smoothed(raw_table(GRID, [(3, 1), (0, 0)], offset_mm=0.05), jobs=2)
+    assert findings == made[1]
+    assert SMOOTH_TABLE.encode(run[SMOOTH_TABLE]) == SMOOTH_TABLE.encode(made[0][SMOOTH_TABLE])

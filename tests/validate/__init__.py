@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 
 class Row(NamedTuple):
-    """One line of the table: what was measured, in which unit, and the most it may be."""
+    """One line of the table: its key in the JSON, what was measured, in which unit, and the most it may be."""
 
+    key: str
     name: str
     value: float
     unit: str

@@ -10,10 +10,11 @@ from pathlib import Path
 from tests.validate import Measurement, Row
 from tests.validate.knees import ROWS as KNEES
 from tests.validate.measured_motion import ROWS as MOTION
+from tests.validate.mesh_and_mirror import ROWS as MESH_AND_MIRROR
 from tests.validate.paper_objects import ROWS as PAPER_OBJECTS
 
 REPORT = Path("build/validate.json")
-ROWS: tuple[Measurement, ...] = (*PAPER_OBJECTS, *KNEES, *MOTION)
+ROWS: tuple[Measurement, ...] = (*PAPER_OBJECTS, *KNEES, *MESH_AND_MIRROR, *MOTION)
 
 
 def line(row: Row) -> str:
@@ -28,7 +29,7 @@ def main(measurements: Sequence[Measurement]) -> int:
     met, measured = True, {}
     for measure in measurements:
         row = measure()
-        measured[row.name] = row.value
+        measured[row.key] = row.value
         sys.stdout.write(line(row) + "\n")
         sys.stdout.flush()
         met = met and row.met

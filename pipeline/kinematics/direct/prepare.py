@@ -1,0 +1,219 @@
+"""Two meshes made ready for the direct solver: numbered edges, cells, samples; once for a pair of bodies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.mesh import TriangleMesh
+from pipeline.kinematics.contact import Pose
+from pipeline.kinematics.direct.height_map import facing_below, rasterise
+from pipeline.kinematics.direct.settings import MapSettings
+from pipeline.kinematics.direct.surfaces import (
+    FAR_MM,
+    NOTHING_MM,
+    Attitude,
+    Bins,
+    Float,
+    HeightMap,
+    Int,
+    Surface,
+)
+from pipeline.kinematics.joint_coordinates import attitude_rotation
+from pipeline.kinematics.ligaments import NO_FIBRES, Fibres
+
+Index = NDArray[np.int64]
+
+#: Side of the cells that sort the triangles of the moving body, mm: about the length of their edges.
+CELL_MM = 0.7
+#: Side of the cubes by which points are put next to their neighbours in memory, mm.
+LOCAL_MM = 3.0
+#: A body is sampled at least so often across its narrower side, if it is as wide as this (mm).
+SAMPLES_ACROSS, LEAST_WIDTH_MM = 64, 5.0
+#: Slopes beyond this do not tilt the cover of a cell: a wall is not the lie of the land.
+STEEPEST_COVER = 2.0
+#: Below the top of the moving body by more than this, nothing of it is looked at, mm.
+SAMPLED_DEPTH_MM = 40.0
+
+
+@dataclass(frozen=True, eq=False)
+class DirectBodies:
+    """A pair of bodies as kernels see them, in their kinematic frames.
+
+    Attributes
+    ----------
+    reference, moving : Surface
+    bins : Bins
+    samples : (S, 3) float64
+    sample_cells : (S,) int32
+    settings : MapSettings
+    """
+
+    reference: Surface
+    moving: Surface
+    bins: Bins
+    samples: Float
+    sample_cells: Int
+    settings: MapSettings
+
+    def at(self, angles_rad: tuple[float, float], about: Pose, fibres: Fibres = NO_FIBRES) -> Attitude:
+        """The pair at flexion and varus, ready for a search about a pose.
+
+        Parameters
+        ----------
+        angles_rad : (flexion, varus)
+        about : Pose
+            Middle of the window; its z tells what is too high to be met, infinite for nothing.
+        fibres : Fibres
+            Attachments on the reference in its own frame.
+        """
+        ceiling = about.z + self.bins.highest + self.settings.headroom_mm
+        turned, span = self._turned(angles_rad, ceiling, fibres)
+        middle, half = np.array([about.x, about.y]), self.settings.window_mm
+        low, high = np.maximum(span[:2], middle - half), np.minimum(span[2:], middle + half)
+        if np.any(high <= low):
+            return turned
+        heights = _empty_map(low, high, self.settings.spacing_mm)
+        rasterise(turned.reference.points, turned.reference.triangles, heights)
+        return turned._replace(heights=heights)
+
+    def turned(self, angles_rad: tuple[float, float], fibres: Fibres = NO_FIBRES) -> Attitude:
+        """The pair at flexion and varus without a height map: enough for exact depths and contacts."""
+        return self._turned(angles_rad, np.inf, fibres)[0]
+
+    def _turned(self, angles_rad: tuple[float, float], ceiling_mm: float, fibres: Fibres) -> tuple[Attitude, Float]:
+        """The pair without a map, and least x, y and greatest x, y of what faces the moving body."""
+        rotation, span = attitude_rotation(*angles_rad), np.empty(4)
+        reference = facing_below(self.reference._replace(points=self.reference.points @ rotation), ceiling_mm, span)
+        attached = fibres._replace(on_reference=fibres.on_reference @ rotation)
+        whole = Attitude(
+            reference, self.moving, self.bins, self.samples, self.sample_cells, NO_MAP, ceiling_mm, attached
+        )
+        return whole, span
+
+
+NO_MAP = HeightMap(np.full((1, 1), NOTHING_MM), 0.0, 0.0, 1.0)
+
+
+def prepare(reference: TriangleMesh, moving: TriangleMesh, settings: MapSettings | None = None) -> DirectBodies:
+    """Make two meshes, each in its kinematic frame, ready for the direct solver.
+
+    Raises
+    ------
+    ValueError
+        When no triangle of the moving body faces along delta.
+    """
+    fixed, moved = _surface(reference), _surface(moving)
+    bins, chosen = _bins(moved), settings or MapSettings()
+    narrowest = float((bins.facing[:, 3:5].max(axis=0) - bins.facing[:, :2].min(axis=0)).min())
+    chosen = replace(chosen, spacing_mm=min(chosen.spacing_mm, max(narrowest, LEAST_WIDTH_MM) / SAMPLES_ACROSS))
+    samples = _samples(moved, chosen.spacing_mm)
+    return DirectBodies(fixed, moved, bins, samples, _cells_of(bins, samples), chosen)
+
+
+def _surface(mesh: TriangleMesh) -> Surface:
+    """The mesh with neighbours next to one another in memory, its edges numbered."""
+    points = np.ascontiguousarray(mesh.points, dtype=np.float64)
+    cube = np.floor((points - points.min(axis=0)) / LOCAL_MM)
+    order = np.lexsort((points[:, 2], cube[:, 0], cube[:, 1], cube[:, 2]))
+    rank = np.empty(len(order), dtype=np.int32)
+    rank[order] = np.arange(len(order), dtype=np.int32)
+    triangles = rank[mesh.triangles]
+    triangles = np.ascontiguousarray(triangles[np.argsort(triangles.min(axis=1), kind="stable")])
+    ends = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+    keys = ends[:, 0].astype(np.int64) * len(points) + ends[:, 1]
+    distinct, number = np.unique(keys, return_inverse=True)
+    return Surface(points[order], triangles, number.reshape(-1, 3).astype(np.int32), len(distinct))
+
+
+def _bins(moving: Surface) -> Bins:
+    """The triangles that face along delta, sorted into cells."""
+    index, facing = _facing(moving)
+    low = facing[:, :2].min(axis=0)
+    first, last = (np.floor((facing[:, k : k + 2] - low) / CELL_MM).astype(np.int64) for k in (0, 3))
+    order = np.lexsort((first[:, 0], first[:, 1]))
+    index, facing, first, last = index[order], facing[order], first[order], last[order]
+    columns, rows = (int(n) + 1 for n in last.max(axis=0))
+    items, cells = _touched(first, last)
+    by_cell = np.argsort(cells[:, 1] * columns + cells[:, 0], kind="stable")
+    items, cells = items[by_cell], cells[by_cell]
+    flat = cells[:, 1] * columns + cells[:, 0]
+    start = np.searchsorted(flat, np.arange(rows * columns + 1)).astype(np.int32)
+    cover = _cover(facing[items], low + cells * CELL_MM, flat, rows * columns)
+    return Bins(
+        x0=float(low[0]),
+        y0=float(low[1]),
+        size=CELL_MM,
+        start=start,
+        items=items.astype(np.int32),
+        triangles=index.astype(np.int32),
+        facing=np.ascontiguousarray(facing),
+        cover=cover.reshape(rows, columns, 4),
+        highest=float(facing[:, 5].max()),
+    )
+
+
+def _facing(surface: Surface) -> tuple[Index, Float]:
+    """Which triangles face along z; box (6), then height at (0, 0) and slopes of the plane of each."""
+    corners = surface.points[surface.triangles]
+    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(u, v)
+    index = np.flatnonzero(normal[:, 2] > 0.0)
+    if not len(index):
+        raise ValueError("no triangle of the moving body faces along delta")
+    corners, normal = corners[index], normal[index]
+    slopes = -normal[:, :2] / normal[:, 2:]
+    height = corners[:, 0, 2] - np.einsum("ij,ij->i", slopes, corners[:, 0, :2])
+    return index, np.column_stack([corners.min(axis=1), corners.max(axis=1), height, slopes])
+
+
+def _touched(first: Index, last: Index) -> tuple[Index, Index]:
+    """Every (item, cell) such that the item's range of cells contains the cell: (K,) items, (K, 2) cells."""
+    size = last - first + 1
+    count = size[:, 0] * size[:, 1]
+    items = np.repeat(np.arange(len(first)), count)
+    place = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    across = size[items, 0]
+    return items, first[items] + np.column_stack([place % across, place // across])
+
+
+def _cover(facing: Float, corner: Float, cell: Index, cells: int) -> Float:
+    """(cells, 4) plane above every triangle within its cell, and the greatest z; see :class:`Bins`."""
+    area = (facing[:, 3] - facing[:, 0]) * (facing[:, 4] - facing[:, 1])
+    weight = np.maximum(np.bincount(cell, area, cells), 1e-12)
+    cover = np.zeros((cells, 4))
+    cover[:, [0, 3]] = -NOTHING_MM
+    for k in (1, 2):
+        lie = np.clip(facing[:, 6 + k], -STEEPEST_COVER, STEEPEST_COVER)
+        cover[:, k] = np.bincount(cell, lie * area, cells) / weight
+    low, high = np.maximum(corner, facing[:, :2]), np.minimum(corner + CELL_MM, facing[:, 3:5])
+    tilt = facing[:, 7:9] - cover[cell, 1:3]
+    np.maximum.at(cover[:, 0], cell, facing[:, 6] + np.maximum(tilt * low, tilt * high).sum(axis=1))
+    np.maximum.at(cover[:, 3], cell, facing[:, 5])
+    return cover
+
+
+def _cells_of(bins: Bins, samples: Float) -> Int:
+    """The cell of each sample."""
+    rows, columns = bins.cover.shape[:2]
+    place = np.floor((samples[:, :2] - [bins.x0, bins.y0]) / bins.size).astype(np.int32)
+    column, row = np.clip(place, 0, [columns - 1, rows - 1]).T
+    return np.ascontiguousarray(row * columns + column, dtype=np.int32)
+
+
+def _samples(moving: Surface, spacing_mm: float) -> Float:
+    """(S, 3) points on top of the moving body above the nodes of a square grid."""
+    upside_down = moving.points * [1.0, 1.0, -1.0]
+    top = _empty_map(upside_down[:, :2].min(axis=0), upside_down[:, :2].max(axis=0), spacing_mm)
+    rasterise(upside_down, np.ascontiguousarray(moving.triangles[:, ::-1]), top)
+    row, column = np.nonzero(top.z < FAR_MM)
+    z = -top.z[row, column]
+    points = np.column_stack([top.x0 + column * spacing_mm, top.y0 + row * spacing_mm, z])
+    return np.ascontiguousarray(points[z > z.max(initial=-NOTHING_MM) - SAMPLED_DEPTH_MM])
+
+
+def _empty_map(low: Float, high: Float, spacing_mm: float) -> HeightMap:
+    columns, rows = (int(n) for n in np.ceil((high - low) / spacing_mm) + 2)
+    return HeightMap(np.full((rows, columns), NOTHING_MM), float(low[0]), float(low[1]), spacing_mm)

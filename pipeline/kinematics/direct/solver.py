@@ -1,0 +1,195 @@
+"""The direct solver: the stable pose at one attitude in a few steps, and exact depths and contacts there.
+
+A stable pose is a local maximum of the depth h(x, y, theta) that the moving body reaches along delta. h is the least of
+many smooth functions, so each step is a small linear programme within a trust region: first over samples of the moving
+body under a height map of the reference, which is quick and sees past single facets, then over the exact features of
+both meshes, so that the pose is a maximum of the triangles themselves and its z is exact contact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.kinematics.cell import Certificate, ProofSettings, certificate
+from pipeline.kinematics.contact import Contacts, Pose
+from pipeline.kinematics.direct.features import clearances
+from pipeline.kinematics.direct.margin import margins
+from pipeline.kinematics.direct.polish import cells_near, depth_at, features_near, narrowed, polish
+from pipeline.kinematics.direct.prepare import DirectBodies
+from pipeline.kinematics.direct.search import new_rows, search
+from pipeline.kinematics.direct.settings import DirectSettings, SearchLimits
+from pipeline.kinematics.direct.surfaces import FAR_MM, Attitude, Float
+from pipeline.kinematics.incremental import StablePose
+from pipeline.kinematics.ligaments import NO_FIBRES, Fibres, fibre_load
+from pipeline.kinematics.solvers import Margin
+from pipeline.kinematics.table import Status
+
+#: Steps of the stability margin: 1 mm, 1 mm, 2 deg.
+MARGIN_STEP = np.array([1.0, 1.0, np.radians(2.0)])
+
+
+class Kernels(NamedTuple):
+    """The three kernels of the solver: compiled, or :data:`pipeline.kinematics.direct.plain.PLAIN`."""
+
+    search: Callable[[Attitude, Float, SearchLimits, Float], int]
+    polish: Callable[[Attitude, Float, SearchLimits, Float], int]
+    depth_at: Callable[[Attitude, Float], float]
+
+
+COMPILED = Kernels(search, polish, depth_at)
+
+#: A pose is left this much short of exact contact, so that it is clear beyond rounding (mm).
+CLEAR_MM = 1e-4
+#: Farther than this from where a window was opened, another is opened (mm).
+WINDOW_MM = 20.0
+#: Contacts on slopes up to 60 degrees are looked for: twice their distance along delta.
+BAND_ALONG = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class DirectSolver:
+    """The direct solver for one pair of bodies.
+
+    Attributes
+    ----------
+    bodies : DirectBodies
+    settings : DirectSettings
+    proof : ProofSettings
+        What counts as a contact of the certificate.
+    fibres : Fibres
+        Attachments on the reference in its own frame.
+    kernels : Kernels
+    """
+
+    bodies: DirectBodies
+    settings: DirectSettings = field(default_factory=DirectSettings)
+    proof: ProofSettings = field(default_factory=ProofSettings)
+    fibres: Fibres = NO_FIBRES
+    kernels: Kernels = COMPILED
+
+    def at(self, angles_rad: tuple[float, float]) -> DirectAttitude:
+        """The bodies at flexion and varus."""
+        return DirectAttitude(self, angles_rad)
+
+
+class DirectAttitude:
+    """Two prepared bodies at one held attitude.
+
+    Parameters
+    ----------
+    solver : DirectSolver
+    angles_rad : (flexion, varus)
+    """
+
+    def __init__(self, solver: DirectSolver, angles_rad: tuple[float, float]) -> None:
+        self.solver = solver
+        self._angles_rad = angles_rad
+        self._whole: Attitude | None = None
+        self._mapped: tuple[Attitude, Pose] | None = None
+
+    def solve(self, start: Pose, centre: Pose | None = None) -> StablePose:
+        """The stable pose reached from ``start``.
+
+        Parameters
+        ----------
+        start : Pose
+            Where the moving body is let go.
+        centre : Pose, optional
+            Middle of the bounds; the start when not given.
+
+        Returns
+        -------
+        StablePose
+            ``NO_CONTACT`` when nothing is met, ``SLID_OFF`` and ``ROTATION_BOUND`` when the body leaves the bounds,
+            ``NOT_CONVERGED`` when the steps run out.
+        """
+        settings, kernels = self.solver.settings, self.solver.kernels
+        mapped, steps = self._run(kernels.search, start, settings.search)
+        if mapped is None:
+            return StablePose(start, Status.SLID_OFF if steps else Status.NO_CONTACT, steps, 0)
+        found, more = self._run(kernels.polish, mapped, settings.polish)
+        if found is None:
+            return StablePose(start, Status.SLID_OFF, steps + more, 0)
+        found = found._replace(z=found.z - CLEAR_MM)
+        status = _out_of_bounds(found, centre or start._replace(z=found.z), settings)
+        if status is None:
+            status = Status.NOT_CONVERGED if steps >= settings.search.steps else Status.OK
+        return StablePose(found, status, steps + more, 0)
+
+    def depth(self, pose: Pose) -> Pose | None:
+        """The pose brought to contact along delta (just clear of it); None where nothing is met."""
+        z = self.solver.kernels.depth_at(self._surfaces_at(pose), _array(pose))
+        return None if z > FAR_MM else pose._replace(z=z - CLEAR_MM)
+
+    def contacts(self, pose: Pose, band_mm: float) -> Contacts:
+        """Features within ``band_mm`` that meet along delta, at a pose just clear of contact; attitude frame."""
+        attitude, place = self._surfaces_at(pose), _array(pose)
+        active = cells_near(attitude, place, BAND_ALONG * band_mm + self.solver.settings.polish.slack_mm)
+        attitude = narrowed(attitude, place, active)
+        features, _ = features_near(attitude, place, np.array([0.0, BAND_ALONG * band_mm]), active)
+        rows = new_rows(len(features))
+        clearances(attitude, features, place, rows)
+        slopes = rows.rates[:, :2]
+        cosine = 1.0 / np.sqrt(1.0 + np.einsum("ij,ij->i", slopes, slopes))
+        gaps = (rows.gaps - pose.z) * cosine
+        near = gaps <= band_mm
+        normals = np.column_stack([slopes, np.full(len(slopes), -1.0)]) * cosine[:, None]
+        points = np.column_stack([rows.arms + place[:2], rows.gaps])
+        return Contacts(points[near], normals[near], gaps[near])
+
+    def certify(self, pose: Pose) -> Certificate:
+        """The certificate of a pose just clear of contact."""
+        proof = self.solver.proof
+        load = fibre_load(self._surfaces_at(pose).fibres, (pose.x, pose.y, pose.theta, pose.z))
+        return certificate(self.contacts(pose, proof.contact_band_mm), pose, proof.eminence_mm, load)
+
+    def margin(self, pose: Pose) -> Margin:
+        """How far the body may be pushed at a stable pose, on the height map."""
+        out = np.empty(3)
+        margins(self._map_about(pose), _array(pose), MARGIN_STEP, out)
+        return Margin(float(out[0]), float(out[1]), float(np.degrees(out[2])))
+
+    def _run(
+        self, kernel: Callable[[Attitude, Float, SearchLimits, Float], int], start: Pose, limits: SearchLimits
+    ) -> tuple[Pose | None, int]:
+        attitude, found = self._map_about(start), np.empty(4)
+        steps = kernel(attitude, _array(start), limits, found)
+        if found[3] + self.solver.bodies.bins.highest > attitude.ceiling_mm:
+            # it got to where the reference was left out: now with all of it
+            self._mapped = self.solver.bodies.at(self._angles_rad, start._replace(z=np.inf), self.solver.fibres), start
+            return self._run(kernel, start, limits)
+        return (None if found[3] > FAR_MM else _pose(found)), steps
+
+    def _map_about(self, pose: Pose) -> Attitude:
+        if self._mapped is None or np.hypot(*np.subtract(pose, self._mapped[1])[:2]) > WINDOW_MM:
+            self._mapped = self.solver.bodies.at(self._angles_rad, pose, self.solver.fibres), pose
+        return self._mapped[0]
+
+    def _surfaces_at(self, pose: Pose) -> Attitude:
+        """Both surfaces, complete about the height of a pose."""
+        if self._mapped is not None and pose.z + self.solver.bodies.bins.highest + 1.0 < self._mapped[0].ceiling_mm:
+            return self._mapped[0]
+        if self._whole is None:
+            self._whole = self.solver.bodies.turned(self._angles_rad, self.solver.fibres)
+        return self._whole
+
+
+def _array(pose: Pose) -> Float:
+    """x, y, theta, z: the order of the kernels."""
+    return np.array([pose.x, pose.y, pose.theta, pose.z])
+
+
+def _pose(found: Float) -> Pose:
+    x, y, theta, z = (float(value) for value in found)
+    return Pose(x, y, z, theta)
+
+
+def _out_of_bounds(pose: Pose, centre: Pose, settings: DirectSettings) -> Status | None:
+    away = np.subtract(pose, centre)
+    if np.hypot(away[0], away[1]) > settings.slide_bound_mm or away[2] > settings.slide_bound_mm:
+        return Status.SLID_OFF
+    return Status.ROTATION_BOUND if abs(away[3]) > settings.rotation_bound_rad else None

@@ -1,0 +1,37 @@
+"""Tasks for worker processes; a module of its own, because a worker imports it by name."""
+
+from __future__ import annotations
+
+import os
+
+from pipeline.errors import CaseRejected
+
+_prepared = False
+
+
+def square(task: int) -> tuple[int, int, bool]:
+    """The square of a number, the process that found it, and whether that was prepared."""
+    return task**2, os.getpid(), _prepared
+
+
+def prepare() -> None:
+    """Remember in this process that it was prepared."""
+    global _prepared  # noqa: PLW0603 - what a worker is told at its start
+    _prepared = True
+
+
+def refuse(task: int) -> int:
+    """Fail at one of the tasks."""
+    if task == 2:
+        raise ValueError(f"task {task} cannot be done")
+    return task
+
+
+def reject(task: int) -> int:
+    """Refuse the case."""
+    raise CaseRejected("E-ABC-01", f"Task {task} is wrong.", "Correct it.")
+
+
+def die(_task: int) -> int:
+    """End the process as a machine short of memory does."""
+    os._exit(9)
