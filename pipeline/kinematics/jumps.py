@@ -35,7 +35,7 @@ class JumpLimits(NamedTuple):
     opens does not jump.
     """
 
-    shift_mm: float = 1.0
+    shift_mm: float = 0.75
     rotation_deg: float = 3.0
 
 

@@ -67,7 +67,7 @@ class Params(ContactParams):
     classic: bool = Field(default=False, description="incremental: the paper's plain rules, not only deeper")
     ligaments: bool = Field(default=False, description="let the fibres of ligaments.csv pull")
     push_n: float = Field(10.0, gt=0, le=5000, description="push along delta that the fibres pull against, newtons")
-    reference_strain: float = Field(
+    reference_strain_fraction: float = Field(
         0.0, gt=-0.5, le=0.5, description="stretch at the scan pose of fibres without a slack length of their own"
     )
     jump_mm: float = Field(
@@ -117,7 +117,7 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     anatomy, grid = reads[ANATOMY], params.grid()
     scan = scan_pose(anatomy.scan_attitude)
     pair = params.pair(reads[REFERENCE_BODY], reads[MOVING_BODY], anatomy)
-    fibres = fibres_of(_wanted(reads, params), anatomy, pair, params.ligament_push_n, params.reference_strain)
+    fibres = fibres_of(_wanted(reads, params), anatomy, pair, params.ligament_push_n, params.reference_strain_fraction)
     joint = Joint(pair, replace(_settings(params), fibres=fibres), out.jobs)
     progress = _Progress(out, int(np.prod(grid.shape)))
     first = spine(grid, anatomy.scan_attitude[0], anatomy.scan_attitude[1], scan)
@@ -236,7 +236,7 @@ def _facts(params: Params, jumped: tuple[Jumps, Jumps], different: Differences) 
     return SweepFacts(
         solver=params.solver,
         push_n=params.ligament_push_n,
-        reference_strain=params.reference_strain,
+        reference_strain=params.reference_strain_fraction,
         jumps_before=before,
         jumps_after=after,
         cross_check=CrossCheck(

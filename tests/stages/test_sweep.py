@@ -322,7 +322,7 @@ def test_a_spring_draws_the_ball_up_its_bowl_until_push_and_pull_are_balanced(so
 
 
 def test_later_stages_are_told_of_the_push_that_ligaments_pulled_against() -> None:
-    settings = {"push_n": 20.0, "reference_strain": 0.04}
+    settings = {"push_n": 20.0, "reference_strain_fraction": 0.04}
     with_them, without = (pulled(40.0, ligaments=wanted, **settings)[SWEEP_FACTS] for wanted in (True, False))
     assert (with_them.push_n, with_them.reference_strain) == (20.0, 0.04)
     assert without.push_n == 0.0
