@@ -50,9 +50,9 @@ check_python() {
 }
 
 install_project() {
-    [ -x .venv/bin/python ] || "$python" -m venv .venv
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement "$lock"
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+    { [ -x .venv/bin/python ] || "$python" -m venv .venv; } &&
+        .venv/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement "$lock" &&
+        .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 }
 
 [ -x .venv/bin/python ] && [ "$(cat "$stamp" 2>/dev/null)" = "$(wanted "$lock")" ] && exit 0

@@ -215,5 +215,7 @@ def _samples(moving: Surface, spacing_mm: float) -> Float:
 
 
 def _empty_map(low: Float, high: Float, spacing_mm: float) -> HeightMap:
-    columns, rows = (int(n) for n in np.ceil((high - low) / spacing_mm) + 2)
-    return HeightMap(np.full((rows, columns), NOTHING_MM), float(low[0]), float(low[1]), spacing_mm)
+    first = np.floor(low / spacing_mm) - 1.0  # nodes at multiples of the spacing: a mirror image has mirrored nodes
+    columns, rows = (int(n) for n in np.ceil(high / spacing_mm) + 2.0 - first)
+    x0, y0 = first * spacing_mm
+    return HeightMap(np.full((rows, columns), NOTHING_MM), float(x0), float(y0), spacing_mm)
