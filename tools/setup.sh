@@ -55,11 +55,24 @@ install_project() {
         .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 }
 
-[ -x .venv/bin/python ] && [ "$(cat "$stamp" 2>/dev/null)" = "$(wanted "$lock")" ] && exit 0
+# Machine code is kept by the file of each kernel alone, so a change in one file would leave old code in another.
+fresh_kernels() {
+    local now
+    now=$(cat pipeline/kinematics/direct/*.py pipeline/kinematics/compilation.py | sha256sum)
+    [ "$(cat .venv/.kernels 2>/dev/null)" = "$now" ] && return 0
+    rm -f pipeline/kinematics/direct/__pycache__/*.nb[ic]
+    .venv/bin/ct2lut compile || stop "The solver could not be compiled." "Type: .venv/bin/ct2lut compile"
+    echo "$now" >.venv/.kernels
+}
+
+if [ -x .venv/bin/python ] && [ "$(cat "$stamp" 2>/dev/null)" = "$(wanted "$lock")" ]; then
+    fresh_kernels
+    exit 0
+fi
 check_python
 install_packages
 echo "installing Python packages into .venv (about 1.5 GB, a few minutes)"
 install_project || stop "The Python packages could not be installed." "Check the network and the free disk space, then run it again."
-.venv/bin/ct2lut compile || stop "The solver could not be compiled." "Type: .venv/bin/ct2lut compile"
+fresh_kernels
 wanted "$lock" >"$stamp"
 wanted requirements.lock >.venv/.setup-run # the developers' lock contains the other
