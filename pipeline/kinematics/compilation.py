@@ -18,3 +18,12 @@ def compiled(function: F) -> F:
     """The function in machine code: same signature, arrays and named tuples of arrays as arguments, never raises."""
     kernel: F = njit(cache=True, nogil=True, error_model="numpy")(function)
     return kernel
+
+
+def inlined(function: F) -> F:
+    """The same for a small function that is called in innermost loops: its body takes the place of each call.
+
+    A call counts references to every array that it is given, which costs more than a few sums.
+    """
+    kernel: F = njit(cache=True, nogil=True, error_model="numpy", inline="always")(function)
+    return kernel

@@ -3,8 +3,8 @@
 The *spine* is the column of varus nearest to the scan's own, walked along flexion from the scan upwards and downwards.
 From each of its cells a *rib* walks out in varus to either side, as an examiner would open the knee at a held flexion.
 The spine is walked out to its ends and back again: the way out is kept, because it is connected to the scan; the way
-back measures the hysteresis, and steps in only where the way out found nothing. Walks do not depend on one another
-(ribs only on the spine), so any number of workers gives the same bytes. Then jumps between neighbours are solved again
+back measures the hysteresis, and steps in only where the way out found nothing. Ribs and the way back depend only on
+the spine, so any number of workers gives the same bytes. Then jumps between neighbours are solved again
 from both sides (see :mod:`pipeline.kinematics.jumps`).
 """
 
@@ -27,14 +27,13 @@ Place = tuple[int, int]
 class Walk(NamedTuple):
     """A walk over neighbouring cells: their (row, column) and their (flexion, varus) in degrees, and the start.
 
-    ``centre`` is the middle of the bounds of every cell: the scan pose. ``and_back``: the way is walked back as well.
+    ``centre`` is the middle of the bounds of every cell: the scan pose.
     """
 
     cells: tuple[Place, ...]
     attitudes_deg: tuple[tuple[float, float], ...]
     start: Pose
     centre: Pose
-    and_back: bool
 
 
 class Release(NamedTuple):
@@ -61,11 +60,39 @@ class Certified(NamedTuple):
 
 
 class Walked(NamedTuple):
-    """What a walk found, in the order of its cells: on the way out, and on the way back if it was walked."""
+    """What a walk found, in the order of its cells."""
 
     cells: tuple[Place, ...]
-    out: tuple[Found, ...]
-    back: tuple[Found, ...]
+    found: tuple[Found, ...]
+
+
+class Ways(NamedTuple):
+    """What was found on the ways out, which reach every cell, and on the way back over the spine."""
+
+    out: tuple[Walked, ...]
+    back: tuple[Walked, ...]
+
+
+def walk_grid(
+    grid: Grid, scan_deg: tuple[float, float], scan: Pose, walk: Callable[[Sequence[Walk]], Sequence[Walked]]
+) -> Ways:
+    """Walk the spine, then the ribs and the way back.
+
+    Parameters
+    ----------
+    grid : Grid
+    scan_deg : (flexion, varus)
+        Attitude of the scan.
+    scan : Pose
+        Found coordinates of the scan itself.
+    walk : callable
+        Makes the walks given, which do not depend on one another.
+    """
+    first = spine(grid, scan_deg[0], scan_deg[1], scan)
+    along = tuple(walk(first))
+    returns = way_back(first, along)
+    rest = tuple(walk((*returns, *ribs(grid, along, scan))))
+    return Ways((*along, *rest[len(returns) :]), rest[: len(returns)])
 
 
 def spine(grid: Grid, scan_flexion_deg: float, scan_varus_deg: float, scan: Pose) -> tuple[Walk, ...]:
@@ -81,7 +108,7 @@ def spine(grid: Grid, scan_flexion_deg: float, scan_varus_deg: float, scan: Pose
     """
     row, column = _nearest(grid.flexion_deg, scan_flexion_deg), _nearest(grid.varus_deg, scan_varus_deg)
     ways = [[(r, column) for r in range(row, grid.shape[0])], [(r, column) for r in range(row - 1, -1, -1)]]
-    walks = [_walk_over(grid, way, scan, scan)._replace(and_back=True) for way in ways if way]
+    walks = [_walk_over(grid, way, scan, scan) for way in ways if way]
     return tuple(sorted(walks, key=lambda walk: -len(walk.cells)))
 
 
@@ -90,7 +117,9 @@ def ribs(grid: Grid, spine_walked: Sequence[Walked], scan: Pose) -> tuple[Walk, 
 
     A rib whose own cell of the spine failed starts from the nearest row that did not; none can start where all failed.
     """
-    starts = {at: one.stable.pose for at, one in kept(spine_walked).items() if one.stable.status.usable}
+    starts = {
+        at: one.stable.pose for at, one in kept(Ways(tuple(spine_walked), ())).items() if one.stable.status.usable
+    }
     if not starts:
         return ()
     column = next(iter(starts))[1]
@@ -103,13 +132,26 @@ def ribs(grid: Grid, spine_walked: Sequence[Walked], scan: Pose) -> tuple[Walk, 
     return tuple(walks)
 
 
+def way_back(walks: Sequence[Walk], walked: Sequence[Walked]) -> tuple[Walk, ...]:
+    """Each walk from its end to its beginning, started from the last usable pose."""
+
+    def end(walk: Walk, one: Walked) -> Pose:
+        poses = [found.stable.pose for found in one.found if found.stable.status.usable]
+        return poses[-1] if poses else walk.start
+
+    return tuple(
+        Walk(walk.cells[::-1], walk.attitudes_deg[::-1], end(walk, one), walk.centre)
+        for walk, one in zip(walks, walked, strict=True)
+    )
+
+
 def _nearest(values: Float, wanted: float) -> int:
     return int(np.argmin(np.abs(values - wanted)))
 
 
 def _walk_over(grid: Grid, cells: Sequence[Place], start: Pose, centre: Pose) -> Walk:
     attitudes = [attitude_deg(grid, at) for at in cells]
-    return Walk(tuple(cells), tuple(attitudes), start, centre, and_back=False)
+    return Walk(tuple(cells), tuple(attitudes), start, centre)
 
 
 def attitude_deg(grid: Grid, at: Place) -> tuple[float, float]:
@@ -123,16 +165,13 @@ def angles_rad(attitude: tuple[float, float]) -> tuple[float, float]:
 
 
 def go(solver: Solver, walk: Walk) -> Walked:
-    """Solve the cells of one walk outwards and back, each started from the last usable pose."""
-    attitudes = [solver.at(angles_rad(one)) for one in walk.attitudes_deg]
-    start, out, back = walk.start, list[Found](), list[Found]()
-    for attitude in attitudes:
-        out.append(Found(start, attitude.solve(start, walk.centre)))
-        start = out[-1].stable.pose if out[-1].stable.status.usable else start
-    for attitude in reversed(attitudes) if walk.and_back else ():
-        back.append(Found(start, attitude.solve(start, walk.centre)))
-        start = back[-1].stable.pose if back[-1].stable.status.usable else start
-    return Walked(walk.cells, tuple(out), tuple(back[::-1]))
+    """Solve the cells of one walk, each started from the last usable pose."""
+    start, found = walk.start, list[Found]()
+    for attitude in walk.attitudes_deg:
+        stable = solver.at(angles_rad(attitude)).solve(start, walk.centre)
+        found.append(Found(start, stable))
+        start = stable.pose if stable.status.usable else start
+    return Walked(walk.cells, tuple(found))
 
 
 def certified(solver: Solver, at: tuple[tuple[float, float], Pose]) -> Certified:
@@ -147,14 +186,17 @@ def let_go(solver: Solver, release: Release) -> StablePose:
     return attitude.solve(release.scan.displaced(release.away), release.scan)
 
 
-def kept(walked: Sequence[Walked]) -> dict[Place, Found]:
+def kept(ways: Ways) -> dict[Place, Found]:
     """What each cell keeps: the way out, or the way back where only that found a pose."""
-    found = {at: out for walk in walked for at, out in zip(walk.cells, walk.out, strict=True)}
-    for walk in walked:
-        for at, back in zip(walk.cells, walk.back, strict=False):
-            if back.stable.status.usable and not found[at].stable.status.usable:
-                found[at] = back
+    found = _by_cell(ways.out)
+    for at, back in _by_cell(ways.back).items():
+        if back.stable.status.usable and not found[at].stable.status.usable:
+            found[at] = back
     return found
+
+
+def _by_cell(walked: Sequence[Walked]) -> dict[Place, Found]:
+    return {at: one for walk in walked for at, one in zip(walk.cells, walk.found, strict=True)}
 
 
 class Hysteresis(NamedTuple):
@@ -164,15 +206,15 @@ class Hysteresis(NamedTuple):
     rotation_deg: Float
 
 
-def hysteresis(grid: Grid, walked: Sequence[Walked]) -> Hysteresis:
-    """What the two passes of every walk that went both ways differ by."""
-    shift, rotation = np.full(grid.shape, np.nan), np.full(grid.shape, np.nan)
-    for walk in walked:
-        for at, out, back in zip(walk.cells, walk.out, walk.back, strict=False):
-            if out.stable.status.usable and back.stable.status.usable:
-                difference = np.subtract(out.stable.pose, back.stable.pose)
-                shift[at] = float(np.linalg.norm(difference[:3]))
-                rotation[at] = float(np.degrees(abs(difference[3])))
+def hysteresis(grid: Grid, ways: Ways) -> Hysteresis:
+    """What the way out and the way back differ by."""
+    shift, rotation, outwards = np.full(grid.shape, np.nan), np.full(grid.shape, np.nan), _by_cell(ways.out)
+    for at, back in _by_cell(ways.back).items():
+        out = outwards[at]
+        if out.stable.status.usable and back.stable.status.usable:
+            difference = np.subtract(out.stable.pose, back.stable.pose)
+            shift[at] = float(np.linalg.norm(difference[:3]))
+            rotation[at] = float(np.degrees(abs(difference[3])))
     return Hysteresis(shift, rotation)
 
 

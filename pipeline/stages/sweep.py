@@ -37,8 +37,7 @@ from pipeline.kinematics.sweep import (
     assemble,
     hysteresis,
     kept,
-    ribs,
-    spine,
+    walk_grid,
 )
 from pipeline.kinematics.table import Grid, RawTable, Status
 from pipeline.records import Anatomy, CrossCheck, JumpCount, LigamentFibre, ScanReturn, SweepFacts
@@ -119,12 +118,9 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     pair = params.pair(reads[REFERENCE_BODY], reads[MOVING_BODY], anatomy)
     fibres = fibres_of(_wanted(reads, params), anatomy, pair, params.ligament_push_n, params.reference_strain_fraction)
     joint = Joint(pair, replace(_settings(params), fibres=fibres), out.jobs)
-    progress = _Progress(out, int(np.prod(grid.shape)))
-    first = spine(grid, anatomy.scan_attitude[0], anatomy.scan_attitude[1], scan)
-    along = joint.walk(first, progress.of(first))
-    across = ribs(grid, along, scan)
-    walked = [*along, *joint.walk(across, progress.of(across))]
-    found, limits = kept(walked), JumpLimits(params.jump_mm, params.jump_deg)
+    progress = _Progress(out, int(np.prod(grid.shape)) + grid.shape[0])
+    ways = walk_grid(grid, anatomy.scan_attitude[:2], scan, lambda walks: joint.walk(walks, progress.of(walks)))
+    found, limits = kept(ways), JumpLimits(params.jump_mm, params.jump_deg)
     before = jumps(grid, found, limits)
     found = mended(found, lambda now: to_solve_again(grid, now, limits, scan), joint.solve_again, params.jump_rounds)
     if not any(one.stable.status.usable for one in found.values()):
@@ -134,7 +130,7 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     claimed = claims(grid, found, known)
     proven, answers = joint.prove(tuple(claimed.values()), asked)
     proofs = dict(zip(claimed, proven, strict=True))
-    table = assemble(grid, found, Evidence(known, proofs), hysteresis(grid, walked))
+    table = assemble(grid, found, Evidence(known, proofs), hysteresis(grid, ways))
     out[RAW_TABLE] = table
     out[SCAN_RETURNS] = _scan_returns(anatomy, params, joint)
     out[NEUTRAL_CURVE] = joint.neutral(table, anatomy.scan_attitude[1], scan)
@@ -192,7 +188,7 @@ def _scan_return(release: Release, stable: StablePose) -> ScanReturn:
 
 
 class _Progress:
-    """Cells done out of all, told as walks finish."""
+    """Cells done out of all, those of the way back as well, told as walks finish."""
 
     def __init__(self, out: Outputs, total: int) -> None:
         self.out, self.total, self.finished = out, total, 0

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.adapters.joint_work import Joint, SolverSettings
 from pipeline.kinematics.body_frames import scan_pose
-from pipeline.kinematics.sweep import Found, Place, kept, ribs, spine
+from pipeline.kinematics.sweep import Found, Place, kept, spine, walk_grid
 from pipeline.kinematics.table import Grid
 from tests.bench import Figure, seconds
 from tests.bench.knees import Knee, cases, knee
@@ -34,8 +34,7 @@ def grid(shape: tuple[int, int]) -> Grid:
 def sweep(joint: Joint, one: Knee, wanted: Grid) -> dict[Place, Found]:
     """A stable pose for every cell: the spine, out and back, then the ribs."""
     scan, (flexion, varus) = scan_pose(one.anatomy.scan_attitude), one.anatomy.scan_attitude[:2]
-    along = joint.walk(spine(wanted, flexion, varus, scan), lambda _: None)
-    return kept([*along, *joint.walk(ribs(wanted, along, scan), lambda _: None)])
+    return kept(walk_grid(wanted, (flexion, varus), scan, lambda walks: joint.walk(walks, lambda _: None)))
 
 
 def sweep_seconds(one: Knee, shape: tuple[int, int], repeats: int) -> float:
@@ -53,7 +52,7 @@ def incremental_cells_per_s(one: Knee) -> float:
     joint = Joint(one.pair, SolverSettings(name="incremental"), JOBS)
     scan, (flexion, varus) = scan_pose(one.anatomy.scan_attitude), one.anatomy.scan_attitude[:2]
     cells = Grid(np.floor(flexion) + np.arange(1.0, SLOW_CELLS + 1.0), np.array([varus]))
-    walk = spine(cells, flexion, varus, scan)[0]._replace(and_back=False)
+    walk = spine(cells, flexion, varus, scan)[0]
     joint.walk([walk._replace(cells=(), attitudes_deg=())] * JOBS, lambda _: None)
     start = time.perf_counter()
     joint.walk([walk] * JOBS, lambda _: None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,6 +21,7 @@ from pipeline.kinematics.sweep import (
     Release,
     Walk,
     Walked,
+    Ways,
     angles_rad,
     assemble,
     attitude_deg,
@@ -32,6 +33,8 @@ from pipeline.kinematics.sweep import (
     pose_table,
     ribs,
     spine,
+    walk_grid,
+    way_back,
 )
 from pipeline.kinematics.table import Grid, RawTable, Status
 from tests.kinematics.hollow_joint import BALL_MM, FACETS_MM, PLACE_MM, PROOF, REST_MM, direct, hollow_pair, incremental
@@ -56,7 +59,7 @@ def lost(status: Status = Status.SLID_OFF, motions: int = 0) -> Found:
 def walked(walk: Walk, failed: frozenset[int] = frozenset()) -> Walked:
     """A walk whose cells have their flexion as z; the rows in ``failed`` have slid off."""
     out = tuple(lost() if at[0] in failed else found(GRID.flexion_deg[at[0]]) for at in walk.cells)
-    return Walked(walk.cells, out, out)
+    return Walked(walk.cells, out)
 
 
 def cells_of(*walks: Walk) -> list[Place]:
@@ -96,11 +99,28 @@ def test_every_walk_goes_from_neighbour_to_neighbour_at_the_attitudes_of_its_cel
         assert list(walk.attitudes_deg) == expected
 
 
-def test_only_the_spine_is_walked_back() -> None:
+def test_the_spine_is_walked_back_from_its_last_usable_pose() -> None:
     along = spine(GRID, 21.0, 0.0, SCAN)
-    across = ribs(GRID, [walked(one) for one in along], SCAN)
-    assert {walk.and_back for walk in along} == {True}
-    assert {walk.and_back for walk in across} == {False}
+    back = way_back(along, [walked(one, frozenset({6})) for one in along])
+    assert [walk.cells for walk in back] == [walk.cells[::-1] for walk in along]
+    assert [walk.attitudes_deg for walk in back] == [walk.attitudes_deg[::-1] for walk in along]
+    assert [walk.start.z for walk in back] == [50.0, 0.0]
+    (lost_way,) = way_back(along[:1], [walked(along[0], frozenset(range(7)))])
+    assert lost_way.start == SCAN
+
+
+def test_a_grid_is_walked_in_two_rounds_and_every_way_is_told_apart() -> None:
+    rounds: list[list[Walk]] = []
+
+    def walk(walks: Sequence[Walk]) -> list[Walked]:
+        rounds.append(list(walks))
+        return [walked(one) for one in walks]
+
+    ways = walk_grid(GRID, (21.0, 0.0), SCAN, walk)
+    assert rounds[0] == list(spine(GRID, 21.0, 0.0, SCAN))
+    assert rounds[1][:2] == list(way_back(rounds[0], [walked(one) for one in rounds[0]]))
+    assert sorted(at for one in ways.out for at in one.cells) == sorted(np.ndindex(GRID.shape))
+    assert [one.cells for one in ways.back] == [one.cells[::-1] for one in rounds[0]]
 
 
 def test_a_rib_starts_from_its_own_cell_of_the_spine_and_is_bound_about_the_scan() -> None:
@@ -118,18 +138,11 @@ def test_a_rib_of_a_failed_cell_starts_from_the_nearest_row_that_did_not_fail() 
     assert starts == {0: 20.0, 1: 20.0, 2: 20.0, 3: 30.0, 4: 30.0, 5: 50.0, 6: 60.0}
 
 
-def test_a_rib_starts_where_only_the_way_back_found_a_pose() -> None:
-    grid = Grid(np.array([0.0]), np.array([0.0, 1.0]))
-    (walk,) = spine(grid, 0.0, 0.0, SCAN)
-    (rib,) = ribs(grid, [Walked(walk.cells, (lost(),), (found(3.5),))], SCAN)
-    assert rib.start.z == 3.5
-
-
 def test_without_a_spine_there_are_no_ribs_and_their_cells_stay_unreached() -> None:
     along = spine(GRID, 21.0, 0.0, SCAN)
     nothing = [walked(one, frozenset(range(7))) for one in along]
     assert ribs(GRID, nothing, SCAN) == ()
-    status = assembled(GRID, kept(nothing)).poses.status
+    status = assembled(GRID, kept(Ways(tuple(nothing), ()))).poses.status
     np.testing.assert_array_equal(status[:, 2], Status.SLID_OFF)
     np.testing.assert_array_equal(status[:, [0, 1, 3]], Status.NOT_CONVERGED)
 
@@ -138,7 +151,7 @@ def test_a_grid_of_one_attitude_is_one_walk() -> None:
     grid = Grid(np.array([30.0]), np.array([1.0]))
     along = spine(grid, 8.0, -3.0, SCAN)
     assert [walk.cells for walk in along] == [((0, 0),)]
-    assert ribs(grid, [Walked(along[0].cells, (found(1.0),), (found(1.0),))], SCAN) == ()
+    assert ribs(grid, [Walked(along[0].cells, (found(1.0),))], SCAN) == ()
 
 
 def test_attitudes_are_those_of_the_grid() -> None:
@@ -178,43 +191,27 @@ class DeeperAttitude:
         return Margin(pose.x, pose.y, float(np.degrees(self.angles[0])))
 
 
-def walk_of(rows: int, *, and_back: bool) -> Walk:
+def walk_of(rows: int) -> Walk:
     """Down the first column in steps of 10 degrees, from z = 0."""
     cells = tuple((row, 0) for row in range(rows))
     attitudes = tuple((10.0 * row, -1.0) for row in range(rows))
-    return Walk(cells, attitudes, Pose(0.0, 0.0, 0.0, 0.0), SCAN, and_back)
+    return Walk(cells, attitudes, Pose(0.0, 0.0, 0.0, 0.0), SCAN)
 
 
-def test_a_walk_goes_out_and_back_from_the_last_usable_pose() -> None:
+def test_a_walk_goes_on_from_the_last_usable_pose() -> None:
     solver = Deeper(failing=frozenset({3}))
-    result = go(solver, walk_of(4, and_back=True))
-    assert [start.z for _, start, _ in solver.asked] == [0, 1, 2, 2, 3, 4, 5, 6]
-    assert [one.start.z for one in (*result.out, *result.back[::-1])] == [0, 1, 2, 2, 3, 4, 5, 6]
-    assert [one.stable.pose.z for one in result.out if one.stable.status.usable] == [1, 2, 3]
-    assert result.out[2].stable.status is Status.SLID_OFF
-    # in the order of the cells: the way back came to the first cell last
-    assert [one.stable.pose.z for one in result.back] == [7, 6, 5, 4]
+    result = go(solver, walk_of(4))
+    assert [start.z for _, start, _ in solver.asked] == [0, 1, 2, 2]
+    assert [one.start.z for one in result.found] == [0, 1, 2, 2]
+    assert [one.stable.pose.z for one in result.found if one.stable.status.usable] == [1, 2, 3]
+    assert result.found[2].stable.status is Status.SLID_OFF
 
 
 def test_a_walk_is_solved_at_its_attitudes_and_bound_about_its_centre() -> None:
     solver = Deeper()
-    go(solver, walk_of(3, and_back=True))
-    flexions = [0.0, 10.0, 20.0, 20.0, 10.0, 0.0]
-    assert [angles for angles, _, _ in solver.asked] == [angles_rad((flexion, -1.0)) for flexion in flexions]
+    go(solver, walk_of(3))
+    assert [angles for angles, _, _ in solver.asked] == [angles_rad((flexion, -1.0)) for flexion in (0.0, 10.0, 20.0)]
     assert {centre for _, _, centre in solver.asked} == {SCAN}
-
-
-def test_a_walk_that_is_not_walked_back_is_solved_once() -> None:
-    solver = Deeper()
-    result = go(solver, walk_of(3, and_back=False))
-    assert [one.stable.pose.z for one in result.out] == [1, 2, 3]
-    assert (len(solver.asked), result.back) == (3, ())
-
-
-def test_a_way_back_that_fails_goes_on_from_the_last_usable_pose() -> None:
-    result = go(Deeper(failing=frozenset({2, 3})), walk_of(2, and_back=True))
-    assert [one.start.z for one in result.back[::-1]] == [1, 1]
-    assert [one.stable.status for one in result.back] == [Status.OK, Status.SLID_OFF]
 
 
 def test_a_body_is_let_go_beside_the_scan_and_bound_about_it() -> None:
@@ -236,8 +233,12 @@ def test_a_pose_is_certified_at_its_attitude() -> None:
 # --- what is kept
 
 
+def one_cell(out: Found, *back: Found) -> Ways:
+    return Ways((Walked(((0, 0),), (out,)),), tuple(Walked(((0, 0),), (one,)) for one in back))
+
+
 def keep(out: Found, *back: Found) -> Found:
-    return kept([Walked(((0, 0),), (out,), back)])[(0, 0)]
+    return kept(one_cell(out, *back))[(0, 0)]
 
 
 def test_the_way_out_is_kept_even_where_the_way_back_is_deeper() -> None:
@@ -256,15 +257,16 @@ def test_two_failed_passes_leave_what_the_way_out_says() -> None:
 
 
 def test_a_pose_of_one_walk_is_not_replaced_by_another_walks_failure() -> None:
-    walks = [Walked(((0, 0), (1, 0)), (found(1.0), lost()), (lost(), found(4.0))), Walked(((0, 1),), (lost(),), ())]
-    assert {at: one.stable.pose.z for at, one in kept(walks).items() if one.stable.status.usable} == {
+    spine_cells, rib = ((0, 0), (1, 0)), Walked(((0, 1),), (lost(),))
+    ways = Ways((Walked(spine_cells, (found(1.0), lost())), rib), (Walked(spine_cells[::-1], (found(4.0), lost())),))
+    assert {at: one.stable.pose.z for at, one in kept(ways).items() if one.stable.status.usable} == {
         (0, 0): 1.0,
         (1, 0): 4.0,
     }
 
 
 def difference(out: Found, *back: Found) -> tuple[float, float]:
-    passes = hysteresis(ONE, [Walked(((0, 0),), (out,), back)])
+    passes = hysteresis(ONE, one_cell(out, *back))
     return float(passes.shift_mm[0, 0]), float(passes.rotation_deg[0, 0])
 
 
@@ -278,11 +280,12 @@ def test_there_is_no_hysteresis_where_a_pass_failed_or_was_not_made() -> None:
         assert np.isnan(difference(*passes)).all()
 
 
-def test_hysteresis_is_known_only_along_walks_that_went_both_ways() -> None:
+def test_hysteresis_is_known_only_along_the_spine() -> None:
     along = spine(GRID, 21.0, 0.0, SCAN)
-    both = [walked(one, frozenset({4})) for one in along]
-    across = [walked(one)._replace(back=()) for one in ribs(GRID, both, SCAN)]
-    known = np.isfinite(hysteresis(GRID, [*both, *across]).shift_mm)
+    out = [walked(one, frozenset({4})) for one in along]
+    back = [Walked(one.cells[::-1], one.found[::-1]) for one in out]
+    across = [walked(one) for one in ribs(GRID, out, SCAN)]
+    known = np.isfinite(hysteresis(GRID, Ways((*out, *across), tuple(back))).shift_mm)
     np.testing.assert_array_equal(np.argwhere(known), [(row, 2) for row in range(7) if row != 4])
 
 
@@ -293,7 +296,7 @@ def assembled(grid: Grid, cells: dict[Place, Found], passes: Hysteresis | None =
     """A table whose usable cells are all certified and proven alike."""
     usable = [at for at, one in cells.items() if one.stable.status.usable]
     evidence = Evidence(dict.fromkeys(usable, Certified(CERTIFICATE, MARGIN)), dict.fromkeys(usable, PROVEN))
-    return assemble(grid, cells, evidence, passes or hysteresis(grid, ()))
+    return assemble(grid, cells, evidence, passes or hysteresis(grid, Ways((), ())))
 
 
 def test_a_usable_cell_holds_all_that_is_known_of_it() -> None:
@@ -321,11 +324,13 @@ def test_a_failed_cell_leaves_its_status_and_nothing_else() -> None:
 def test_cells_go_to_their_place_in_whatever_order_walks_come() -> None:
     grid = Grid(np.array([0.0, 10.0, 20.0]), np.array([-1.0, 1.0]))
     walks = [
-        Walked(cells, tuple(found(10.0 * row + column) for row, column in cells), ())
+        Walked(cells, tuple(found(10.0 * row + column) for row, column in cells))
         for cells in (((1, 1), (2, 1)), ((1, 0),), ((0, 1),), ((0, 0),), ((2, 0),))
     ]
     for order in (walks, walks[::-1]):
-        np.testing.assert_array_equal(assembled(grid, kept(order)).poses.proximal_mm, [[0, 1], [10, 11], [20, 21]])
+        np.testing.assert_array_equal(
+            assembled(grid, kept(Ways(tuple(order), ()))).poses.proximal_mm, [[0, 1], [10, 11], [20, 21]]
+        )
 
 
 def test_a_table_holds_every_measure_in_its_unit() -> None:
@@ -353,14 +358,13 @@ def solver(request: pytest.FixtureRequest) -> Solver:
 def swept(solver: Solver) -> RawTable:
     """A ball in a bowl about the middle of the flexion axis: every attitude sees the same joint."""
     grid = Grid(np.array([0.0, 15.0, 30.0]), np.array([-5.0, 0.0, 5.0]))
-    along = [go(solver, walk) for walk in spine(grid, 14.0, 1.0, SCAN)]
-    walks = [*along, *(go(solver, walk) for walk in ribs(grid, along, SCAN))]
-    poses = {at: one.stable.pose for at, one in kept(walks).items()}
+    ways = walk_grid(grid, (14.0, 1.0), SCAN, lambda walks: [go(solver, walk) for walk in walks])
+    poses = {at: one.stable.pose for at, one in kept(ways).items()}
     known = {at: certified(solver, (attitude_deg(grid, at), pose)) for at, pose in poses.items()}
     claims = {at: Claim(angles_rad(attitude_deg(grid, at)), poses[at], one.certificate) for at, one in known.items()}
     bodies = hollow_pair().bodies()
     proofs = {at: prove(bodies, claim, PROOF.ladder_mm) for at, claim in claims.items()}
-    return assemble(grid, kept(walks), Evidence(known, proofs), hysteresis(grid, walks))
+    return assemble(grid, kept(ways), Evidence(known, proofs), hysteresis(grid, ways))
 
 
 def test_the_answer_is_the_same_at_every_attitude(swept: RawTable) -> None:

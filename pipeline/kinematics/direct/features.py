@@ -7,351 +7,302 @@ pose is the least of all features that are *there* (corner within the face, cros
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
 
-from pipeline.kinematics.compilation import compiled
-from pipeline.kinematics.direct.surfaces import FAR_MM, NOTHING_MM, SHARED, Attitude, Bins, Float, Int, Rows, Surface
+from pipeline.kinematics.compilation import compiled, inlined
+from pipeline.kinematics.direct.surfaces import (
+    NOTHING_MM,
+    PEAK_CELLS,
+    SHARED,
+    Attitude,
+    Bins,
+    Flags,
+    Float,
+    Int,
+    Rows,
+)
 
-#: Kinds of features: a corner of the moving body under a face, a corner of the reference above a face, two edges.
-CORNER_BELOW, CORNER_ABOVE, CROSSING = 0, 1, 2
 #: Edges whose cross product seen along z is below this (mm^2) do not cross.
 PARALLEL = 1e-12
 
-Bytes = NDArray[np.uint8]
-Flags = NDArray[np.bool_]
-#: No triangle has claimed its corners and edges yet.
-UNCLAIMED = 255
-
 Cell = tuple[int, int]
-#: A reference triangle, and a cell.
-At = tuple[int, int]
-#: Box and plane of a reference triangle, the last to meet each triangle of the moving body, and the reach.
-Span = tuple[Float, Int, Float]
-#: x, y and the cosine and sine of theta of a pose.
-Place = tuple[float, float, float, float]
-
-#: Clearance, its slopes in x and y, and the place (x, y) from the moving origin.
-Feature = tuple[float, float, float, float, float]
+#: x0, y0 and size of the cells.
+Corner = tuple[float, float, float]
+#: Three corners, and the number of the side from corner k to corner k + 1.
+Side = tuple[Float, int]
 
 
 @compiled
-def _may_meet(facing: Float, item: int, own: Float, sideways: float, highest: float) -> bool:
-    """Whether two triangles, each as box and plane, may come as near as a depth.
-
-    Bounded from below by the clearance of the two planes over what the boxes share.
-    """
-    x0, x1 = max(own[0] - sideways, facing[item, 0]), min(own[3] + sideways, facing[item, 3])
-    y0, y1 = max(own[1] - sideways, facing[item, 1]), min(own[4] + sideways, facing[item, 4])
-    # one comparison for three reasons: a processor guesses it right
-    if max(x0 - x1, y0 - y1, own[2] - facing[item, 5] - highest) > 0.0:
-        return False
-    gx, gy = own[7] - facing[item, 7], own[8] - facing[item, 8]
-    middle = own[6] - facing[item, 6] + 0.5 * (gx * (x0 + x1) + gy * (y0 + y1))
-    tilt = 0.5 * (abs(gx) * (x1 - x0) + abs(gy) * (y1 - y0))
-    return bool(middle - tilt - sideways * (abs(own[7]) + abs(own[8])) <= highest)
-
-
-@compiled
-def layout_of(bins: Bins) -> Float:
-    """Where the cells lie: x0, y0, cells per mm, columns, rows."""
-    return np.array([bins.x0, bins.y0, 1.0 / bins.size, bins.cover.shape[1], bins.cover.shape[0]])
-
-
-@compiled
-def box_and_cells(corner: Float, layout: Float, sideways: float, own: Float, cells: Int) -> None:
-    """Write least and greatest x, y, z of three corners; first and last column, first and last row of their cells."""
-    for j in range(3):
-        own[j] = min(corner[0, j], corner[1, j], corner[2, j])
-        own[j + 3] = max(corner[0, j], corner[1, j], corner[2, j])
-    for axis in range(2):
-        first, last = own[axis] - sideways - layout[axis], own[axis + 3] + sideways - layout[axis]
-        cells[2 * axis] = max(int(np.floor(first * layout[2])), 0)
-        cells[2 * axis + 1] = min(int(np.floor(last * layout[2])), int(layout[axis + 3]) - 1)
-
-
-@compiled
-def any_active(active: Flags, layout: Float, cells: Int) -> bool:
-    """Whether one of a range of cells is active."""
-    columns = int(layout[3])
-    for j in range(cells[2], cells[3] + 1):
-        for i in range(cells[0], cells[1] + 1):
-            if active[j * columns + i]:
-                return True
-    return False
-
-
-@compiled
-def _plane(corner: Float, own: Float) -> bool:
-    """Write height at (0, 0) and slopes of the plane of three corners; whether it faces against z."""
-    ux, uy, uz = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
-    vx, vy, vz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
-    det = ux * vy - vx * uy
-    if det >= 0.0:
-        return False
-    own[7], own[8] = (uz * vy - vz * uy) / det, (ux * vz - vx * uz) / det
-    own[6] = corner[0, 2] - own[7] * corner[0, 0] - own[8] * corner[0, 1]
-    return True
-
-
-@compiled
-def _above_cell(cover: Float, layout: Float, cell: Cell, own: Float, sideways: float) -> float:
-    """Bound from below of the clearance of a triangle, as box and plane, above a cell of the moving body."""
-    i, j = cell
-    size = 1.0 / layout[2]
-    gx, gy = own[7] - cover[j, i, 1], own[8] - cover[j, i, 2]
-    x0, y0 = layout[0] + i * size, layout[1] + j * size
-    x1, y1 = min(x0 + size, own[3] + sideways), min(y0 + size, own[4] + sideways)
-    x0, y0 = max(x0, own[0] - sideways), max(y0, own[1] - sideways)
-    planes = own[6] - cover[j, i, 0] + min(gx * x0, gx * x1) + min(gy * y0, gy * y1)
-    least: float = max(planes - sideways * (abs(own[7]) + abs(own[8])), own[2] - cover[j, i, 3])
-    return least
-
-
-@compiled
-def near_pairs(reference: Surface, bins: Bins, pose: Float, reach: Float, active: Flags) -> Int:
-    """Pairs of triangles that may meet within a reach of a pose.
+def triangles_over(attitude: Attitude, active: Flags, pose: Float, ceiling: float, around: float) -> Int:
+    """Triangles of the reference that may come above an active cell which reaches up to them.
 
     Parameters
     ----------
-    reference : Surface
-        Attitude frame.
-    bins : Bins
-        Of the moving body.
+    attitude : Attitude
+    active : (NY, NX) bool
+        Cells of the moving body that are looked at.
     pose : (3,) float64
         x, y (mm), theta (rad).
-    reach : (2,) float64
-        Sideways motion allowed for (mm), and the depth z (mm) above which clearances do not matter.
-    active : (NY * NX,) bool
+    ceiling : float
+        Clearances above this do not matter, mm.
+    around : float
+        No point of the body gets farther sideways from this pose, mm.
+
+    Returns
+    -------
+    (K,) int32
+    """
+    spots, peaks = attitude.spots, _peaks(attitude.bins, active)
+    x0, y0, size = attitude.bins.x0, attitude.bins.y0, attitude.bins.size
+    c, s, x, y = np.cos(pose[2]), np.sin(pose[2]), pose[0], pose[1]
+    near, count = np.empty(spots.shape[0], np.int32), 0
+    for t in range(spots.shape[0]):
+        if spots[t, 2] + around <= PEAK_CELLS * size:
+            u, v = spots[t, 0] - x, spots[t, 1] - y
+            i = int(np.floor((c * u + s * v - x0) / size)) + PEAK_CELLS
+            j = int(np.floor((c * v - s * u - y0) / size)) + PEAK_CELLS
+            if min(i, j, peaks.shape[1] - 1 - i, peaks.shape[0] - 1 - j) < 0 or spots[t, 3] - peaks[j, i] > ceiling:
+                continue
+        near[count] = t
+        count += 1
+    return near[:count]
+
+
+@compiled
+def _peaks(bins: Bins, active: Flags) -> Float:
+    """Greatest z of the active cells within ``PEAK_CELLS`` of each cell, from so many cells before the first on."""
+    rows, columns = active.shape
+    around = 2 * PEAK_CELLS + 1
+    peaks = np.full((rows + around - 1, columns + around - 1), -NOTHING_MM)
+    for j in range(rows):
+        for i in range(columns):
+            if active[j, i]:
+                for n in range(j, j + around):
+                    for m in range(i, i + around):
+                        peaks[n, m] = max(peaks[n, m], bins.cover[j, i, 3])
+    return peaks
+
+
+@compiled
+def near_pairs(attitude: Attitude, active: Flags, among: Int, pose: Float, ceiling: float) -> Int:
+    """Pairs of triangles that may meet at a pose below a ceiling.
+
+    Parameters
+    ----------
+    attitude : Attitude
+    active : (NY, NX) bool
         Cells that are looked at.
+    among : (M,) int32
+        Triangles of the reference that are looked at.
+    pose : (3,) float64
+        x, y (mm), theta (rad).
+    ceiling : float
+        Clearances above this do not matter, mm.
 
     Returns
     -------
     (K, 2) int32
-        Reference and moving triangle. Every feature with a clearance below ``reach[1]``, at any pose within the
-        sideways reach and in an active cell, belongs to one of them.
+        Reference and moving triangle. Every feature of these with a clearance up to the ceiling in an active cell
+        belongs to one of them.
     """
-    points, triangles, cover = reference.points, reference.triangles, bins.cover
-    sideways, ceiling, highest = reach[0], reach[1], bins.highest
+    start, items, spans = attitude.bins.start, attitude.bins.items, attitude.bins.spans
+    facing, numbers, cover = attitude.bins.facing, attitude.bins.triangles, attitude.bins.cover
+    corner = (attitude.bins.x0, attitude.bins.y0, attitude.bins.size)
+    near, boxes, cells = _boxes(attitude, among, pose)
+    seen = np.full(facing.shape[0], -1, dtype=np.int32)
+    pairs, count = np.empty((1024, 2), dtype=np.int32), 0
+    for n in range(near.shape[0]):
+        t, x0, y0, x1, y1 = near[n], boxes[n, 0], boxes[n, 1], boxes[n, 3], boxes[n, 4]
+        least = boxes[n, 2] - ceiling
+        for j in range(cells[n, 2], cells[n, 3] + 1):
+            for i in range(cells[n, 0], cells[n, 1] + 1):
+                if not active[j, i] or cover[j, i, 3] < least or _above_cell(cover, (i, j), corner, boxes, n) > ceiling:
+                    continue
+                cell = j * cover.shape[1] + i
+                if count + start[cell + 1] - start[cell] > pairs.shape[0]:
+                    pairs = _longer(pairs, start[cell + 1] - start[cell])
+                for k in range(start[cell], start[cell + 1]):
+                    # one comparison for five reasons: a processor guesses it right
+                    if (
+                        max(x0 - spans[k, 2], spans[k, 0] - x1, y0 - spans[k, 3], spans[k, 1] - y1, least - spans[k, 4])
+                        > 0.0
+                    ):
+                        continue
+                    item = items[k]
+                    if seen[item] != t and _planes_meet(facing, item, boxes, n, ceiling):
+                        seen[item] = t
+                        pairs[count, 0], pairs[count, 1] = t, numbers[item]
+                        count += 1
+    return pairs[:count]
+
+
+@compiled
+def _boxes(attitude: Attitude, among: Int, pose: Float) -> tuple[Int, Float, Int]:
+    """Boxes, planes and cells of triangles of the reference that lie over the moving body.
+
+    Returns
+    -------
+    near : (K,) int32
+        Which.
+    boxes : (K, 9) float64
+        Least x, y, z, greatest x, y, z in the moving frame, then height at (0, 0) and slopes in x and y of the plane.
+    cells : (K, 4) int32
+        First and last column, first and last row of the cells below.
+    """
+    points, triangles = attitude.reference.points, attitude.reference.triangles
+    x0, y0, per, count = attitude.bins.x0, attitude.bins.y0, 1.0 / attitude.bins.size, 0
+    rows, columns = attitude.bins.cover.shape[:2]
     c, s, px, py = np.cos(pose[2]), np.sin(pose[2]), pose[0], pose[1]
-    corner, own, cells = np.empty((3, 3)), np.empty(9), np.empty(4, dtype=np.int32)
-    layout = layout_of(bins)
-    seen = np.full(bins.facing.shape[0], -1, dtype=np.int32)
-    pairs, count = np.empty((4096, 2), dtype=np.int32), 0
-    for t in range(triangles.shape[0]):
-        lowest = min(points[triangles[t, 0], 2], points[triangles[t, 1], 2], points[triangles[t, 2], 2])
-        if lowest - highest > ceiling:
+    near, boxes, cells = np.empty(among.size, np.int32), np.empty((among.size, 9)), np.empty((among.size, 4), np.int32)
+    for t in among:
+        a, b, d = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        u, v = points[a, 0] - px, points[a, 1] - py
+        ax, ay, az = c * u + s * v, c * v - s * u, points[a, 2]
+        u, v = points[b, 0] - px, points[b, 1] - py
+        ux, uy, uz = c * u + s * v - ax, c * v - s * u - ay, points[b, 2] - az
+        u, v = points[d, 0] - px, points[d, 1] - py
+        vx, vy, vz = c * u + s * v - ax, c * v - s * u - ay, points[d, 2] - az
+        low_x, low_y = ax + min(0.0, ux, vx), ay + min(0.0, uy, vy)
+        high_x, high_y = ax + max(0.0, ux, vx), ay + max(0.0, uy, vy)
+        # what lies before the first cell rounds to it: one cell too many does no harm
+        i0, i1 = max(int((low_x - x0) * per), 0), min(int((high_x - x0) * per), columns - 1)
+        j0, j1 = max(int((low_y - y0) * per), 0), min(int((high_y - y0) * per), rows - 1)
+        det = ux * vy - vx * uy
+        if det >= 0.0 or i0 > i1 or j0 > j1:
             continue
-        for k in range(3):
-            u, v = points[triangles[t, k], 0] - px, points[triangles[t, k], 1] - py
-            corner[k, 0], corner[k, 1], corner[k, 2] = c * u + s * v, c * v - s * u, points[triangles[t, k], 2]
-        box_and_cells(corner, layout, sideways, own, cells)
-        if not any_active(active, layout, cells) or not _plane(corner, own):
-            continue
-        for j in range(cells[2], cells[3] + 1):
-            for i in range(cells[0], cells[1] + 1):
-                open_cell = active[j * cover.shape[1] + i]
-                if open_cell and _above_cell(cover, layout, (i, j), own, sideways) <= ceiling:
-                    pairs, count = _with_cell(bins, (t, j * cover.shape[1] + i), (own, seen, reach), pairs, count)
-    return pairs[:count].copy()
+        gx, gy = (uz * vy - vz * uy) / det, (ux * vz - vx * uz) / det
+        near[count] = t
+        boxes[count, 0], boxes[count, 1], boxes[count, 2] = low_x, low_y, az + min(0.0, uz, vz)
+        boxes[count, 3], boxes[count, 4], boxes[count, 5] = high_x, high_y, az + max(0.0, uz, vz)
+        boxes[count, 6], boxes[count, 7], boxes[count, 8] = az - gx * ax - gy * ay, gx, gy
+        cells[count, 0], cells[count, 1], cells[count, 2], cells[count, 3] = i0, i1, j0, j1
+        count += 1
+    return near[:count], boxes[:count], cells[:count]
+
+
+@inlined
+def _above_cell(cover: Float, cell: Cell, corner: Corner, boxes: Float, n: int) -> float:
+    """Bound from below of the clearance of a triangle, by its box and plane, above a cell of the moving body."""
+    i, j = cell
+    size, gx, gy = corner[2], boxes[n, 7] - cover[j, i, 1], boxes[n, 8] - cover[j, i, 2]
+    x0, y0 = corner[0] + i * size, corner[1] + j * size
+    x1, y1 = min(x0 + size, boxes[n, 3]), min(y0 + size, boxes[n, 4])
+    x0, y0 = max(x0, boxes[n, 0]), max(y0, boxes[n, 1])
+    least: float = boxes[n, 6] - cover[j, i, 0] + min(gx * x0, gx * x1) + min(gy * y0, gy * y1)
+    return least
+
+
+@inlined
+def _planes_meet(facing: Float, item: int, boxes: Float, n: int, ceiling: float) -> bool:
+    """Whether the planes of two triangles come as near as a ceiling over what their boxes share."""
+    x0, x1 = max(boxes[n, 0], facing[item, 0]), min(boxes[n, 3], facing[item, 3])
+    y0, y1 = max(boxes[n, 1], facing[item, 1]), min(boxes[n, 4], facing[item, 4])
+    gx, gy = boxes[n, 7] - facing[item, 7], boxes[n, 8] - facing[item, 8]
+    middle = boxes[n, 6] - facing[item, 6] + 0.5 * (gx * (x0 + x1) + gy * (y0 + y1))
+    tilt = 0.5 * (abs(gx) * (x1 - x0) + abs(gy) * (y1 - y0))
+    return bool(middle - tilt <= ceiling)
 
 
 @compiled
-def _with_cell(bins: Bins, at: At, triangle: Span, pairs: Int, count: int) -> tuple[Int, int]:
-    """Add the pairs of one reference triangle with the triangles of one cell that it has not met in another cell."""
-    t, cell = at
-    own, seen, reach = triangle
-    items, facing, numbers = bins.items, bins.facing, bins.triangles
-    for k in range(bins.start[cell], bins.start[cell + 1]):
-        item = items[k]
-        if seen[item] != t and _may_meet(facing, item, own, reach[0], reach[1]):
-            seen[item] = t
-            if count == pairs.shape[0]:
-                pairs = _longer(pairs)
-            pairs[count, 0], pairs[count, 1] = t, numbers[item]
-            count += 1
-    return pairs, count
-
-
-@compiled
-def _longer(pairs: Int) -> Int:
-    out = np.empty((2 * pairs.shape[0], pairs.shape[1]), dtype=np.int32)
+def _longer(pairs: Int, more: int) -> Int:
+    out = np.empty((2 * pairs.shape[0] + more, pairs.shape[1]), dtype=np.int32)
     out[: pairs.shape[0]] = pairs
     return out
 
 
-class Claims(NamedTuple):
-    """Which corners and edges of a surface have been taken, and by whom.
-
-    Attributes
-    ----------
-    owned : (M,) uint8
-        Bits of what each triangle owns; ``UNCLAIMED`` before its turn.
-    points, edges : (N,), (E,) bool
-        What is taken.
-    """
-
-    owned: Bytes
-    points: Flags
-    edges: Flags
-
-
 @compiled
-def features_of(attitude: Attitude, pairs: Int, pose: Float, sideways: float) -> Int:
-    """(K, 5) features of triangle pairs that may be there within a sideways reach, each once.
-
-    ``CORNER_BELOW``: moving point, reference triangle. ``CORNER_ABOVE``: reference point, moving triangle.
-    ``CROSSING``: two reference points, two moving points.
-    """
-    reference, moving = attitude.reference, attitude.moving
-    corners, others, edges, other_edges = reference.triangles, moving.triangles, reference.edges, moving.edges
-    above, below = reference.points, moving.points
-    claims, other_claims = _no_claims(reference), _no_claims(moving)
-    own_r, own_m = claims.owned, other_claims.owned
+def rows_of(attitude: Attitude, pairs: Int, pose: Float, ceiling: float) -> Rows:
+    """Every feature of some pairs of triangles that is there at a pose, once, with a clearance up to a ceiling."""
+    above, below = attitude.reference.points, attitude.moving.points
+    corners, others = attitude.reference.triangles, attitude.moving.triangles
+    own_above, own_below = attitude.reference.owned, attitude.moving.owned
     c, s, px, py = np.cos(pose[2]), np.sin(pose[2]), pose[0], pose[1]
-    out, count = np.empty((15 * len(pairs), 5), dtype=np.int32), 0
-    first, second = np.empty((3, 2)), np.empty((3, 2))
-    for p in range(len(pairs)):
+    first, second, face, other = np.empty((3, 3)), np.empty((3, 3)), np.empty(9), np.empty(9)
+    found, count = np.empty((256, 5)), 0
+    for p in range(pairs.shape[0]):
         t, m = pairs[p, 0], pairs[p, 1]
-        _claim(corners, edges, t, claims)
-        _claim(others, other_edges, m, other_claims)
         for k in range(3):
             first[k, 0], first[k, 1] = above[corners[t, k], 0] - px, above[corners[t, k], 1] - py
+            first[k, 2], second[k, 2] = above[corners[t, k], 2], below[others[m, k], 2]
             x, y = below[others[m, k], 0], below[others[m, k], 1]
             second[k, 0], second[k, 1] = c * x - s * y, s * x + c * y
+        _face(first, face)
+        _face(second, other)
+        if count + MOST_OF_A_PAIR > found.shape[0]:
+            found = _more_rows(found)
         for k in range(3):
-            if own_m[m] >> k & 1 and _near_triangle(first, second[k, 0], second[k, 1], sideways):
-                out[count, 0], out[count, 1], out[count, 2] = CORNER_BELOW, others[m, k], t
-                count += 1
-            if own_r[t] >> k & 1 and _near_triangle(second, first[k, 0], first[k, 1], sideways):
-                out[count, 0], out[count, 1], out[count, 2] = CORNER_ABOVE, corners[t, k], m
-                count += 1
-            for n in range(3):
-                both = own_r[t] >> (k + 3) & 1 and own_m[m] >> (n + 3) & 1
-                if both and _near_edges(first, k, second, n, sideways):
-                    out[count, 0], out[count, 1], out[count, 2] = CROSSING, corners[t, k], corners[t, (k + 1) % 3]
-                    out[count, 3], out[count, 4] = others[m, n], others[m, (n + 1) % 3]
-                    count += 1
-    return out[:count].copy()
+            if own_below[m] >> k & 1 and _over(face, second, k, found, count):
+                found[count, 0] -= second[k, 2]
+                count += found[count, 0] <= ceiling
+            if own_above[t] >> k & 1 and _over(other, first, k, found, count):
+                found[count, 0] = first[k, 2] - found[count, 0]
+                count += found[count, 0] <= ceiling
+            if own_above[t] >> (k + 3) & 1:
+                for n in range(3):
+                    if own_below[m] >> (n + 3) & 1 and _crossing((first, k), (second, n), found, count):
+                        count += found[count, 0] <= ceiling
+    return _rows(found[:count])
 
 
-@compiled
-def _near_triangle(corner: Float, x: float, y: float, sideways: float) -> bool:
-    """Whether (x, y) lies within a distance of the box of three corners."""
-    x0, x1 = min(corner[0, 0], corner[1, 0], corner[2, 0]), max(corner[0, 0], corner[1, 0], corner[2, 0])
-    y0, y1 = min(corner[0, 1], corner[1, 1], corner[2, 1]), max(corner[0, 1], corner[1, 1], corner[2, 1])
-    return bool(max(x0 - x, x - x1, y0 - y, y - y1) <= sideways)
+#: Two triangles have no more features than this: six corners and nine crossings of edges.
+MOST_OF_A_PAIR = 15
 
 
-@compiled
-def _near_edges(first: Float, k: int, second: Float, n: int, sideways: float) -> bool:
-    """Whether the boxes of edge k and edge n of two triangles come within a distance."""
-    apart = -1.0
-    for axis in range(2):
-        a, b = first[k, axis], first[(k + 1) % 3, axis]
-        p, q = second[n, axis], second[(n + 1) % 3, axis]
-        apart = max(apart, min(a, b) - max(p, q), min(p, q) - max(a, b))
-    return apart <= sideways
-
-
-@compiled
-def _claim(triangles: Int, edges: Int, t: int, claims: Claims) -> None:
-    """Let the first triangle that comes own its corners (bits 0..2) and edges (bits 3..5): each counts once."""
-    if claims.owned[t] != UNCLAIMED:
-        return
-    bits = 0
-    for k in range(3):
-        if not claims.points[triangles[t, k]]:
-            claims.points[triangles[t, k]] = True
-            bits |= 1 << k
-        if not claims.edges[edges[t, k]]:
-            claims.edges[edges[t, k]] = True
-            bits |= 8 << k
-    claims.owned[t] = bits
-
-
-@compiled
-def _no_claims(surface: Surface) -> Claims:
-    return Claims(
-        np.full(len(surface.triangles), UNCLAIMED, np.uint8),
-        np.zeros(len(surface.points), np.bool_),
-        np.zeros(surface.edge_count, np.bool_),
-    )
-
-
-@compiled
-def clearances(attitude: Attitude, features: Int, pose: Float, found: Rows) -> float:
-    """Clearance of each feature along z at a pose, and its slopes; the least: the depth of the body at this pose."""
-    reference, moving = attitude.reference, attitude.moving
-    place = (pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2]))
-    least = NOTHING_MM
-    for k in range(features.shape[0]):
-        kind = features[k, 0]
-        if kind == CORNER_BELOW:
-            gap, gx, gy, rx, ry = _corner_below(reference, moving, features, k, place)
-        elif kind == CORNER_ABOVE:
-            gap, gx, gy, rx, ry = _corner_above(reference, moving, features, k, place)
-        else:
-            gap, gx, gy, rx, ry = _crossing(reference, moving, features, k, place)
-        found.gaps[k] = gap
-        found.rates[k, 0], found.rates[k, 1], found.rates[k, 2] = gx, gy, gy * rx - gx * ry
-        found.arms[k, 0], found.arms[k, 1] = rx, ry
-        least = min(least, gap)
-    return least
-
-
-@compiled
-def _over_triangle(points: Float, triangles: Int, face: int, x: float, y: float) -> tuple[float, float, float]:
-    """Height of a face above (x, y) and its slopes; ``NOTHING_MM`` where the point is not below it."""
-    a, b, c = triangles[face, 0], triangles[face, 1], triangles[face, 2]
-    ax, ay, az = points[a, 0], points[a, 1], points[a, 2]
-    ux, uy, uz = points[b, 0] - ax, points[b, 1] - ay, points[b, 2] - az
-    vx, vy, vz = points[c, 0] - ax, points[c, 1] - ay, points[c, 2] - az
+@inlined
+def _face(corner: Float, face: Float) -> None:
+    """Write the first corner, the slopes of both barycentric coordinates and those of the height of a triangle."""
+    ux, uy, uz = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
+    vx, vy, vz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
     per = 1.0 / (ux * vy - vx * uy)
-    v, w = ((x - ax) * vy - vx * (y - ay)) * per, (ux * (y - ay) - (x - ax) * uy) * per
-    if min(v, w, 1.0 - v - w) < -SHARED:
-        return NOTHING_MM, 0.0, 0.0
-    return az + v * uz + w * vz, (uz * vy - vz * uy) * per, (ux * vz - vx * uz) * per
+    face[0], face[1], face[2] = corner[0, 0], corner[0, 1], corner[0, 2]
+    face[3], face[4], face[5], face[6] = vy * per, -vx * per, -uy * per, ux * per
+    face[7], face[8] = (uz * vy - vz * uy) * per, (ux * vz - vx * uz) * per
 
 
-@compiled
-def _corner_below(reference: Surface, moving: Surface, features: Int, k: int, place: Place) -> Feature:
-    x, y, c, s = place
-    p, face = features[k, 1], features[k, 2]
-    rx = c * moving.points[p, 0] - s * moving.points[p, 1]
-    ry = s * moving.points[p, 0] + c * moving.points[p, 1]
-    z, gx, gy = _over_triangle(reference.points, reference.triangles, face, rx + x, ry + y)
-    return (z - moving.points[p, 2] if z < FAR_MM else z), gx, gy, rx, ry
+@inlined
+def _over(face: Float, corners: Float, k: int, found: Float, row: int) -> bool:
+    """Whether a face lies above or below a corner; its height there, its slopes and the place are written."""
+    x, y = corners[k, 0], corners[k, 1]
+    dx, dy = x - face[0], y - face[1]
+    v, w = dx * face[3] + dy * face[4], dx * face[5] + dy * face[6]
+    found[row, 0], found[row, 1], found[row, 2] = face[2] + dx * face[7] + dy * face[8], face[7], face[8]
+    found[row, 3], found[row, 4] = x, y
+    return bool(min(v, w, 1.0 - v - w) >= -SHARED)
 
 
-@compiled
-def _corner_above(reference: Surface, moving: Surface, features: Int, k: int, place: Place) -> Feature:
-    x, y, c, s = place
-    p, face = features[k, 1], features[k, 2]
-    rx, ry = reference.points[p, 0] - x, reference.points[p, 1] - y
-    z, gx, gy = _over_triangle(moving.points, moving.triangles, face, c * rx + s * ry, c * ry - s * rx)
-    return (reference.points[p, 2] - z if z < FAR_MM else z), c * gx - s * gy, s * gx + c * gy, rx, ry
-
-
-@compiled
-def _crossing(reference: Surface, moving: Surface, features: Int, k: int, place: Place) -> Feature:
-    x, y, c, s = place
-    a, b, p, q = features[k, 1], features[k, 2], features[k, 3], features[k, 4]
-    ax, ay, az = reference.points[a, 0] - x, reference.points[a, 1] - y, reference.points[a, 2]
-    ux, uy = reference.points[b, 0] - x - ax, reference.points[b, 1] - y - ay
-    uz = reference.points[b, 2] - az
-    px, py, pz = moving.points[p, 0], moving.points[p, 1], moving.points[p, 2]
-    ex, ey, vz = moving.points[q, 0] - px, moving.points[q, 1] - py, moving.points[q, 2] - pz
-    dx, dy = c * px - s * py - ax, s * px + c * py - ay
-    vx, vy = c * ex - s * ey, s * ex + c * ey
+@inlined
+def _crossing(above: Side, below: Side, found: Float, row: int) -> bool:
+    """Whether a side of one triangle crosses one of the other below it; clearance, slopes and place are written."""
+    (first, a), (second, p) = above, below
+    b, q = (a + 1) % 3, (p + 1) % 3
+    ux, uy, uz = first[b, 0] - first[a, 0], first[b, 1] - first[a, 1], first[b, 2] - first[a, 2]
+    vx, vy, vz = second[q, 0] - second[p, 0], second[q, 1] - second[p, 1], second[q, 2] - second[p, 2]
+    dx, dy = second[p, 0] - first[a, 0], second[p, 1] - first[a, 1]
     det = ux * vy - vx * uy
     if abs(det) < PARALLEL:
-        return NOTHING_MM, 0.0, 0.0, 0.0, 0.0
+        return False
     per = 1.0 / det
     on_u, on_v = (dx * vy - vx * dy) * per, (dx * uy - ux * dy) * per
-    if min(on_u, 1.0 - on_u, on_v, 1.0 - on_v) < 0.0:
-        return NOTHING_MM, 0.0, 0.0, 0.0, 0.0
-    gap = az + on_u * uz - pz - on_v * vz
-    return gap, (uz * vy - vz * uy) * per, (ux * vz - vx * uz) * per, ax + on_u * ux, ay + on_u * uy
+    found[row, 0] = first[a, 2] + on_u * uz - second[p, 2] - on_v * vz
+    found[row, 1], found[row, 2] = (uz * vy - vz * uy) * per, (ux * vz - vx * uz) * per
+    found[row, 3], found[row, 4] = first[a, 0] + on_u * ux, first[a, 1] + on_u * uy
+    return bool(min(on_u, 1.0 - on_u, on_v, 1.0 - on_v) >= 0.0)
+
+
+@compiled
+def _more_rows(found: Float) -> Float:
+    out = np.empty((2 * found.shape[0], found.shape[1]))
+    out[: found.shape[0]] = found
+    return out
+
+
+@compiled
+def _rows(found: Float) -> Rows:
+    """Rows from clearance, slopes in x and y, and place."""
+    count = found.shape[0]
+    rows = Rows(np.empty(count), np.empty((count, 3)), np.empty((count, 2)))
+    for k in range(count):
+        rows.gaps[k], rows.rates[k, 0], rows.rates[k, 1] = found[k, 0], found[k, 1], found[k, 2]
+        rows.rates[k, 2] = found[k, 2] * found[k, 3] - found[k, 1] * found[k, 4]
+        rows.arms[k, 0], rows.arms[k, 1] = found[k, 3], found[k, 4]
+    return rows

@@ -3,43 +3,82 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipeline.kinematics.compilation import compiled
-from pipeline.kinematics.direct.surfaces import FAR_MM, NOTHING_MM, SHARED, Float, HeightMap, Int, Rows, Surface
-
-Index = NDArray[np.int64]
+from pipeline.kinematics.compilation import compiled, inlined
+from pipeline.kinematics.direct.surfaces import (
+    FAR_MM,
+    NOTHING_MM,
+    SHARED,
+    STEEPEST,
+    Body,
+    Float,
+    HeightMap,
+    Int,
+    Rows,
+    Surface,
+)
 
 
 @compiled
-def facing_below(surface: Surface, ceiling_mm: float, box: Float) -> Surface:
+def facing_below(body: Body, ceiling_mm: float, box: Float) -> tuple[Surface, Float]:
     """The triangles whose normal opposes z and whose lowest corner lies below a ceiling, and what they span.
+
+    Walls are left out. The first triangle that comes owns its corners and edges.
 
     Parameters
     ----------
-    surface : Surface
+    body : Body
+        Points and spheres in the attitude frame.
     ceiling_mm : float
     box : (4,) float64
         Written: least x and y, greatest x and y.
+
+    Returns
+    -------
+    surface : Surface
+    spots : (M, 4) float64
+        See :class:`Attitude`.
     """
-    points, triangles, edges = surface.points, surface.triangles, surface.edges
-    kept, numbers, count = np.empty_like(triangles), np.empty_like(edges), 0
+    points, triangles, spheres, count = body.points, body.triangles, body.spheres, 0
+    kept, owned, spots = np.empty_like(triangles), np.empty(len(triangles), np.uint8), np.empty((len(triangles), 4))
+    taken, taken_edges = np.zeros(points.shape[0], np.bool_), np.zeros(body.edge_count, np.bool_)
     box[0], box[1], box[2], box[3] = np.inf, np.inf, -np.inf, -np.inf
-    for t in range(triangles.shape[0]):
-        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-        if min(points[a, 2], points[b, 2], points[c, 2]) > ceiling_mm:
+    for block in range(spheres.shape[0]):
+        if spheres[block, 2] - spheres[block, 3] > ceiling_mm:
             continue
-        ux, uy = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
-        vx, vy = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1]
-        if ux * vy - vx * uy >= 0.0:
-            continue
-        for k in range(3):
-            kept[count, k], numbers[count, k] = triangles[t, k], edges[t, k]
-        count += 1
-        for axis in range(2):
-            box[axis] = min(box[axis], points[a, axis], points[b, axis], points[c, axis])
-            box[axis + 2] = max(box[axis + 2], points[a, axis], points[b, axis], points[c, axis])
-    return Surface(points, kept[:count], numbers[:count], surface.edge_count)
+        for t in range(body.blocks[block], body.blocks[block + 1]):
+            a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+            lowest = min(points[a, 2], points[b, 2], points[c, 2])
+            if lowest > ceiling_mm or not _opposes(points, a, b, c):
+                continue
+            bits = 0
+            for k in range(3):
+                corner, edge = triangles[t, k], body.edges[t, k]
+                bits |= ((not taken[corner]) << k) | ((not taken_edges[edge]) << (k + 3))
+                taken[corner], taken_edges[edge], kept[count, k] = True, True, corner
+            owned[count] = bits
+            for axis in range(2):
+                low = min(points[a, axis], points[b, axis], points[c, axis])
+                high = max(points[a, axis], points[b, axis], points[c, axis])
+                box[axis], box[axis + 2] = min(box[axis], low), max(box[axis + 2], high)
+                spots[count, axis] = (points[a, axis] + points[b, axis] + points[c, axis]) / 3.0
+            away = 0.0
+            for k in range(3):
+                corner = triangles[t, k]
+                x, y = points[corner, 0] - spots[count, 0], points[corner, 1] - spots[count, 1]
+                away = max(away, x * x + y * y)
+            spots[count, 2], spots[count, 3] = np.sqrt(away), lowest
+            count += 1
+    return Surface(points, kept[:count], owned[:count]), spots[:count]
+
+
+@inlined
+def _opposes(points: Float, a: int, b: int, c: int) -> bool:
+    """Whether the normal of a triangle opposes z; that of a wall does not."""
+    ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+    vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+    nx, ny, nz = uy * vz - vy * uz, uz * vx - vz * ux, ux * vy - vx * uy
+    return bool(nz < 0.0 and nx * nx + ny * ny <= STEEPEST * STEEPEST * nz * nz)
 
 
 @compiled
@@ -71,19 +110,17 @@ def rasterise(points: Float, triangles: Int, heights: HeightMap) -> None:
 
 
 @compiled
-def gaps_at(heights: HeightMap, samples: Float, chosen: Index, pose: Float, found: Rows) -> float:
-    """Gap along z of each chosen sample at a pose, and its change per mm of x, of y and per rad of theta.
+def gaps_at(heights: HeightMap, samples: Float, pose: Float, found: Rows) -> float:
+    """Gap along z of each sample at a pose, and its change per mm of x, of y and per rad of theta.
 
     Parameters
     ----------
     heights : HeightMap
     samples : (S, 3) float64
-    chosen : (K,) int64
-        Samples to look at.
     pose : (3,) float64
         x, y (mm) and theta (rad).
     found : Rows
-        Written at ``chosen``; gaps are ``NOTHING_MM`` where the reference is not above the sample.
+        Written; gaps are ``NOTHING_MM`` where the reference is not above the sample.
 
     Returns
     -------
@@ -94,7 +131,7 @@ def gaps_at(heights: HeightMap, samples: Float, chosen: Index, pose: Float, foun
     c, s, per = np.cos(pose[2]), np.sin(pose[2]), 1.0 / heights.spacing
     gaps, rates, z = found.gaps, found.rates, heights.z
     least = NOTHING_MM
-    for k in chosen:
+    for k in range(samples.shape[0]):
         rx = c * samples[k, 0] - s * samples[k, 1]
         ry = s * samples[k, 0] + c * samples[k, 1]
         u, v = (rx + pose[0] - heights.x0) * per, (ry + pose[1] - heights.y0) * per
@@ -110,5 +147,28 @@ def gaps_at(heights: HeightMap, samples: Float, chosen: Index, pose: Float, foun
         rates[k, 0] = ((z01 - z00) * (1.0 - v) + (z11 - z10) * v) * per
         rates[k, 1] = ((z10 - z00) * (1.0 - u) + (z11 - z01) * u) * per
         rates[k, 2] = rates[k, 1] * rx - rates[k, 0] * ry
+        least = min(least, gaps[k])
+    return least
+
+
+@compiled
+def depth_over(heights: HeightMap, samples: Float, pose: Float, gaps: Float) -> float:
+    """Write the gap of every sample as :func:`gaps_at` does, without its change; the least."""
+    ny, nx = heights.z.shape
+    c, s, per, z = np.cos(pose[2]), np.sin(pose[2]), 1.0 / heights.spacing, heights.z
+    least = NOTHING_MM
+    for k in range(samples.shape[0]):
+        rx = c * samples[k, 0] - s * samples[k, 1]
+        ry = s * samples[k, 0] + c * samples[k, 1]
+        u, v = (rx + pose[0] - heights.x0) * per, (ry + pose[1] - heights.y0) * per
+        gaps[k] = NOTHING_MM
+        if min(u, v, nx - 1 - u, ny - 1 - v) <= 0.0:
+            continue
+        i, j = int(u), int(v)
+        z00, z01, z10, z11 = z[j, i], z[j, i + 1], z[j + 1, i], z[j + 1, i + 1]
+        if max(z00, z01, z10, z11) > FAR_MM:
+            continue
+        u, v = u - i, v - j
+        gaps[k] = (z00 * (1.0 - u) + z01 * u) * (1.0 - v) + (z10 * (1.0 - u) + z11 * u) * v - samples[k, 2]
         least = min(least, gaps[k])
     return least

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.kinematics.compilation import compiled
-from pipeline.kinematics.direct.height_map import gaps_at
-from pipeline.kinematics.direct.search import new_rows
+from pipeline.kinematics.direct.height_map import depth_over
 from pipeline.kinematics.direct.surfaces import FAR_MM, Attitude, Float
 
 #: Steps to either side.
@@ -32,10 +31,9 @@ def margins(attitude: Attitude, pose: Float, step: Float, out: Float) -> None:
         Length of a step in x, y (mm) and theta (rad); at most ``STEPS`` are made.
     out : (3,) float64
     """
-    samples = attitude.samples
-    chosen = np.arange(0, samples.shape[0], THINNING)
-    found, trial = new_rows(samples.shape[0]), pose.copy()
-    rest = gaps_at(attitude.heights, samples, chosen, pose, found)
+    samples, trial = attitude.samples[::THINNING].copy(), pose.copy()
+    gaps = np.empty(samples.shape[0])
+    rest = depth_over(attitude.heights, samples, pose, gaps)
     for axis in range(3):
         out[axis] = STEPS * step[axis]
         for sense in (-1.0, 1.0):
@@ -43,7 +41,7 @@ def margins(attitude: Attitude, pose: Float, step: Float, out: Float) -> None:
             for count in range(1, STEPS + 1):
                 trial[:] = pose
                 trial[axis] += sense * count * step[axis]
-                depth = gaps_at(attitude.heights, samples, chosen, trial, found)
+                depth = depth_over(attitude.heights, samples, trial, gaps)
                 if depth > lowest + ROUGH_MM or depth > FAR_MM:
                     out[axis] = min(out[axis], (count - 1) * step[axis])
                     break

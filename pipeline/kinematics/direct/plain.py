@@ -11,8 +11,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from pipeline.kinematics.direct.kernels import Kernels
 from pipeline.kinematics.direct.settings import SearchLimits
-from pipeline.kinematics.direct.solver import Kernels
 from pipeline.kinematics.direct.surfaces import FAR_MM, NOTHING_MM, SHARED, Attitude, Float, HeightMap, Int, Rows
 from pipeline.kinematics.least_rate import best_motion
 from pipeline.kinematics.ligaments import fibre_load
@@ -78,8 +78,7 @@ def search(attitude: Attitude, start: Float, limits: SearchLimits, found: Float)
 
 def polish(attitude: Attitude, start: Float, limits: SearchLimits, found: Float) -> int:
     """Climb on the triangles; see :func:`pipeline.kinematics.direct.polish.polish`."""
-    patient = limits._replace(steps=20 * limits.steps)
-    return _climb(attitude, start, patient, found, lambda pose: exact_rows(attitude, pose))
+    return _climb(attitude, start, limits, found, lambda pose: exact_rows(attitude, pose))
 
 
 def depth_at(attitude: Attitude, pose: Float) -> float:

@@ -9,13 +9,17 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.kinematics.contact import Pose
+from pipeline.kinematics.direct.enclosure import Hull, hull
 from pipeline.kinematics.direct.height_map import facing_below, rasterise
 from pipeline.kinematics.direct.settings import MapSettings
 from pipeline.kinematics.direct.surfaces import (
     FAR_MM,
     NOTHING_MM,
+    STEEPEST,
     Attitude,
     Bins,
+    Bits,
+    Body,
     Float,
     HeightMap,
     Int,
@@ -27,9 +31,11 @@ from pipeline.kinematics.ligaments import NO_FIBRES, Fibres
 Index = NDArray[np.int64]
 
 #: Side of the cells that sort the triangles of the moving body, mm: about the length of their edges.
-CELL_MM = 0.7
-#: Side of the cubes by which points are put next to their neighbours in memory, mm.
-LOCAL_MM = 3.0
+CELL_MM = 1.0
+#: Bits of each coordinate in the order by which points and triangles are kept next to their neighbours.
+Z_ORDER_BITS = 10
+#: So many neighbouring triangles are looked at together.
+BLOCK_TRIANGLES = 16
 #: A body is sampled at least so often across its narrower side, if it is as wide as this (mm).
 SAMPLES_ACROSS, LEAST_WIDTH_MM = 64, 5.0
 #: Slopes beyond this do not tilt the cover of a cell: a wall is not the lie of the land.
@@ -48,14 +54,20 @@ class DirectBodies:
     bins : Bins
     samples : (S, 3) float64
     sample_cells : (S,) int32
+    reach_mm : float
+        How far the samples lie from the moving origin, in (x, y).
+    hulls : (Hull, Hull)
+        Of reference and moving body.
     settings : MapSettings
     """
 
-    reference: Surface
+    reference: Body
     moving: Surface
     bins: Bins
     samples: Float
     sample_cells: Int
+    reach_mm: float
+    hulls: tuple[Hull, Hull]
     settings: MapSettings
 
     def at(self, angles_rad: tuple[float, float], about: Pose, fibres: Fibres = NO_FIBRES) -> Attitude:
@@ -71,7 +83,7 @@ class DirectBodies:
         """
         ceiling = about.z + self.bins.highest + self.settings.headroom_mm
         turned, span = self._turned(angles_rad, ceiling, fibres)
-        middle, half = np.array([about.x, about.y]), self.settings.window_mm
+        middle, half = np.array([about.x, about.y]), self.reach_mm + self.settings.window_mm
         low, high = np.maximum(span[:2], middle - half), np.minimum(span[2:], middle + half)
         if np.any(high <= low):
             return turned
@@ -86,12 +98,15 @@ class DirectBodies:
     def _turned(self, angles_rad: tuple[float, float], ceiling_mm: float, fibres: Fibres) -> tuple[Attitude, Float]:
         """The pair without a map, and least x, y and greatest x, y of what faces the moving body."""
         rotation, span = attitude_rotation(*angles_rad), np.empty(4)
-        reference = facing_below(self.reference._replace(points=self.reference.points @ rotation), ceiling_mm, span)
+        spheres = self.reference.spheres.copy()
+        spheres[:, :3] = spheres[:, :3] @ rotation
+        body = self.reference._replace(points=self.reference.points @ rotation, spheres=spheres)
+        reference, spots = facing_below(body, ceiling_mm, span)
         attached = fibres._replace(on_reference=fibres.on_reference @ rotation)
-        whole = Attitude(
-            reference, self.moving, self.bins, self.samples, self.sample_cells, NO_MAP, ceiling_mm, attached
+        pair = Attitude(
+            reference, spots, self.moving, self.bins, self.samples, self.sample_cells, NO_MAP, ceiling_mm, attached
         )
-        return whole, span
+        return pair, span
 
 
 NO_MAP = HeightMap(np.full((1, 1), NOTHING_MM), 0.0, 0.0, 1.0)
@@ -105,30 +120,65 @@ def prepare(reference: TriangleMesh, moving: TriangleMesh, settings: MapSettings
     ValueError
         When no triangle of the moving body faces along delta.
     """
-    fixed, moved = _surface(reference), _surface(moving)
-    bins, chosen = _bins(moved), settings or MapSettings()
+    fixed, body = _body(reference), _body(moving)
+    bins, chosen = _bins(body), settings or MapSettings()
+    moved = Surface(body.points, body.triangles, _owned(body, np.sort(bins.triangles)))
     narrowest = float((bins.facing[:, 3:5].max(axis=0) - bins.facing[:, :2].min(axis=0)).min())
     chosen = replace(chosen, spacing_mm=min(chosen.spacing_mm, max(narrowest, LEAST_WIDTH_MM) / SAMPLES_ACROSS))
     samples = _samples(moved, chosen.spacing_mm)
-    return DirectBodies(fixed, moved, bins, samples, _cells_of(bins, samples), chosen)
+    reach_mm = float(np.hypot(samples[:, 0], samples[:, 1]).max(initial=0.0))
+    hulls = hull(reference), hull(moving)
+    return DirectBodies(fixed, moved, bins, samples, _cells_of(bins, samples), reach_mm, hulls, chosen)
 
 
-def _surface(mesh: TriangleMesh) -> Surface:
+def _body(mesh: TriangleMesh) -> Body:
     """The mesh with neighbours next to one another in memory, its edges numbered."""
     points = np.ascontiguousarray(mesh.points, dtype=np.float64)
-    cube = np.floor((points - points.min(axis=0)) / LOCAL_MM)
-    order = np.lexsort((points[:, 2], cube[:, 0], cube[:, 1], cube[:, 2]))
+    order = np.argsort(_z_order(points), kind="stable")
     rank = np.empty(len(order), dtype=np.int32)
     rank[order] = np.arange(len(order), dtype=np.int32)
     triangles = rank[mesh.triangles]
-    triangles = np.ascontiguousarray(triangles[np.argsort(triangles.min(axis=1), kind="stable")])
+    middle = points[mesh.triangles].mean(axis=1)
+    triangles = np.ascontiguousarray(triangles[np.argsort(_z_order(middle), kind="stable")])
     ends = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
     keys = ends[:, 0].astype(np.int64) * len(points) + ends[:, 1]
     distinct, number = np.unique(keys, return_inverse=True)
-    return Surface(points[order], triangles, number.reshape(-1, 3).astype(np.int32), len(distinct))
+    blocks = np.append(np.arange(0, len(triangles), BLOCK_TRIANGLES), len(triangles)).astype(np.int32)
+    spheres = _spheres(points[order][triangles], blocks)
+    return Body(points[order], triangles, number.reshape(-1, 3).astype(np.int32), len(distinct), blocks, spheres)
 
 
-def _bins(moving: Surface) -> Bins:
+def _owned(body: Body, facing: Index) -> Bits:
+    """Corners and edges of the facing triangles, each owned by the first that has it; see :class:`Surface`."""
+    owned = np.zeros(len(body.triangles), np.uint8)
+    for numbers, first_bit in ((body.triangles, 0), (body.edges, 3)):
+        _, place = np.unique(numbers[facing], return_index=True)
+        np.bitwise_or.at(owned, facing[place // 3], (1 << (place % 3 + first_bit)).astype(np.uint8))
+    return owned
+
+
+def _z_order(points: Float) -> NDArray[np.uint64]:
+    """(N,) place of each point on a Z-order curve (Morton 1966): neighbours in space are mostly neighbours on it."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    share = (points - low) / max(float((high - low).max()), np.finfo(np.float64).tiny)
+    cell = (share * (2**Z_ORDER_BITS - 1)).astype(np.uint64)
+    code = np.zeros(len(points), np.uint64)
+    for bit in range(Z_ORDER_BITS):
+        for axis in range(3):
+            code |= (cell[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return code
+
+
+def _spheres(corners: Float, blocks: Int) -> Float:
+    """(B, 4) centre and radius about the (M, 3, 3) corners of each block."""
+    low = np.minimum.reduceat(corners.min(axis=1), blocks[:-1])
+    high = np.maximum.reduceat(corners.max(axis=1), blocks[:-1])
+    centre = 0.5 * (low + high)
+    away = np.linalg.norm(corners - np.repeat(centre, np.diff(blocks), axis=0)[:, None], axis=2).max(axis=1)
+    return np.column_stack([centre, np.maximum.reduceat(away, blocks[:-1])])
+
+
+def _bins(moving: Body) -> Bins:
     """The triangles that face along delta, sorted into cells."""
     index, facing = _facing(moving)
     low = facing[:, :2].min(axis=0)
@@ -148,6 +198,7 @@ def _bins(moving: Surface) -> Bins:
         size=CELL_MM,
         start=start,
         items=items.astype(np.int32),
+        spans=np.ascontiguousarray(facing[items][:, [0, 1, 3, 4, 5]]),
         triangles=index.astype(np.int32),
         facing=np.ascontiguousarray(facing),
         cover=cover.reshape(rows, columns, 4),
@@ -155,12 +206,12 @@ def _bins(moving: Surface) -> Bins:
     )
 
 
-def _facing(surface: Surface) -> tuple[Index, Float]:
+def _facing(body: Body) -> tuple[Index, Float]:
     """Which triangles face along z; box (6), then height at (0, 0) and slopes of the plane of each."""
-    corners = surface.points[surface.triangles]
+    corners = body.points[body.triangles]
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(u, v)
-    index = np.flatnonzero(normal[:, 2] > 0.0)
+    index = np.flatnonzero(normal[:, 2] * STEEPEST > np.hypot(normal[:, 0], normal[:, 1]))
     if not len(index):
         raise ValueError("no triangle of the moving body faces along delta")
     corners, normal = corners[index], normal[index]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.kinematics.compilation import compiled
+from pipeline.kinematics.compilation import compiled, inlined
 from pipeline.kinematics.direct.surfaces import Float
 from pipeline.kinematics.least_rate import LEAST_PIVOT, MAX_STEPS, OPTIMAL_MM
 
@@ -74,11 +74,31 @@ def best_motion(rates: Float, slack: Float, rows: Index, box: Float, motion: Flo
             break
     for j in range(3):
         motion[j] = -basis.prices[j + 1]
+    _drop_idle(rates, slack, rows, motion)
     least: float = basis.prices[0]
     return least
 
 
 @compiled
+def _drop_idle(rates: Float, slack: Float, rows: Index, motion: Float) -> None:
+    """Set to zero every component that gains nothing, so that a body does not drift along a neutral direction."""
+    least = _advance(rates, slack, rows, motion)
+    for j in (2, 1, 0):
+        kept, motion[j] = motion[j], 0.0
+        if _advance(rates, slack, rows, motion) < least - OPTIMAL_MM:
+            motion[j] = kept
+
+
+@inlined
+def _advance(rates: Float, slack: Float, rows: Index, motion: Float) -> float:
+    """The least of ``slack + rates @ motion`` over some rows."""
+    least, x, y, turn = np.inf, motion[0], motion[1], motion[2]
+    for k in rows:
+        least = min(least, slack[k] + rates[k, 0] * x + rates[k, 1] * y + rates[k, 2] * turn)
+    return least
+
+
+@inlined
 def _entering(rates: Float, slack: Float, rows: Index, box: Float, basis: Basis) -> float:
     """Write the column violated most and return its cost; NaN when none is."""
     least, enter = -OPTIMAL_MM, -1
@@ -101,7 +121,7 @@ def _entering(rates: Float, slack: Float, rows: Index, box: Float, basis: Basis)
     return cost
 
 
-@compiled
+@inlined
 def _exchange(basis: Basis, cost: float) -> bool:
     """Let a column enter the basis in place of the row that reaches zero first; False when none does."""
     inverse, column, direction = basis.inverse, basis.column, np.zeros(4)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.kinematics.compilation import compiled
-from pipeline.kinematics.direct.height_map import Index, gaps_at
-from pipeline.kinematics.direct.programme import best_motion
+from pipeline.kinematics.direct.height_map import depth_over, gaps_at
+from pipeline.kinematics.direct.programme import Index, best_motion
 from pipeline.kinematics.direct.settings import SearchLimits
-from pipeline.kinematics.direct.surfaces import FAR_MM, Attitude, Float, Rows
+from pipeline.kinematics.direct.surfaces import FAR_MM, Attitude, Bins, Float, Rows
 from pipeline.kinematics.ligaments import LEAST_PUSH, Fibres
 
 
@@ -41,10 +41,10 @@ def fibre_load(fibres: Fibres, pose: Float, load: Float) -> float:
 
 
 @compiled
-def rows_within(gaps: Float, among: Index, highest: float, out: Index) -> int:
+def rows_within(gaps: Float, highest: float, out: Index) -> int:
     """Write the rows whose gap is below a height; how many."""
     count = 0
-    for k in among:
+    for k in range(gaps.shape[0]):
         if gaps[k] < highest:
             out[count] = k
             count += 1
@@ -85,20 +85,32 @@ def search(attitude: Attitude, start: Float, limits: SearchLimits, found: Float)
     int
         Linear programmes solved; ``limits.steps`` where they ran out, 0 where nothing is above the body at the start.
     """
-    heights, samples, fibres = attitude.heights, attitude.samples, attitude.fibres
-    count = samples.shape[0]
-    every, near, rows = np.arange(count), np.empty(count, np.int64), np.empty(count, np.int64)
-    here, there, programme = new_rows(count), new_rows(count), new_rows(count)
+    heights, samples, fibres, lever = attitude.heights, attitude.samples, attitude.fibres, farthest(attitude.bins)
+    gaps, close = np.empty(samples.shape[0]), np.empty_like(samples)
+    rows, here, there, programme = np.empty(0, np.int64), new_rows(0), new_rows(0), new_rows(0)
     pose, trial, anchor = start.copy(), start.copy(), start.copy()
     load, motion, box = np.zeros(4), np.zeros(3), np.zeros(3)
-    pose[3] = gaps_at(heights, samples, every, pose, here)
-    energy = fibre_load(fibres, pose, load)
-    around = limits.steepest * limits.largest_mm
-    near_count = rows_within(here.gaps, every, pose[3] + around, near)
-    trust, step = limits.first_mm, 0
-    while trust > limits.last_mm and step < limits.steps and pose[3] < FAR_MM:
+    trust, step, count, energy = limits.first_mm, 0, 0, 0.0
+    around, sure, look = limits.steepest * limits.largest_mm, -np.inf, True
+    while True:
+        if look or trust <= limits.last_mm:
+            pose[3] = depth_over(heights, samples, pose, gaps)
+            energy = fibre_load(fibres, pose, load)
+            if pose[3] - energy < sure:
+                # a wall came up from out of sight: back to where all was seen, and look farther
+                pose[:], around, trust = anchor, 2.0 * around, 0.5 * limits.first_mm
+                depth_over(heights, samples, pose, gaps)
+                energy = fibre_load(fibres, pose, load)
+            elif trust <= limits.last_mm:
+                break
+            count = samples_below(samples, gaps, pose[3] + around, close)
+            here, there, programme, rows = new_rows(count), new_rows(count), new_rows(count), np.empty(count, np.int64)
+            gaps_at(heights, close[:count], pose, here)
+            anchor[:], sure, look = pose, pose[3] - energy, False
+        if step >= limits.steps or pose[3] > FAR_MM:
+            break
         step += 1
-        row_count = rows_within(here.gaps, near[:near_count], pose[3] + limits.steepest * trust, rows)
+        row_count = rows_within(here.gaps, pose[3] + limits.steepest * trust, rows)
         loaded_rows(here, rows[:row_count], pose[3], load, programme)
         box[0], box[1], box[2] = trust, trust, trust / limits.radius_mm
         promise = best_motion(programme.rates, programme.gaps, rows[:row_count], box, motion)
@@ -106,10 +118,7 @@ def search(attitude: Attitude, start: Float, limits: SearchLimits, found: Float)
             trust *= 0.3
             continue
         trial[:3] = pose[:3] + motion
-        trial[3] = gaps_at(heights, samples, near[:near_count], trial, there)
-        if trial[3] > FAR_MM:
-            pose[:] = trial
-            break
+        trial[3] = gaps_at(heights, close[:count], trial, there)
         new_energy = fibre_load(fibres, trial, load)
         gain = trial[3] - pose[3] - (new_energy - energy)
         if gain < 0.1 * promise:
@@ -120,17 +129,34 @@ def search(attitude: Attitude, start: Float, limits: SearchLimits, found: Float)
         here, there = there, here
         if gain > 0.7 * promise:
             trust = min(2.0 * trust, limits.largest_mm)
-        if sideways_way(pose, anchor, limits.radius_mm) > limits.largest_mm:
-            pose[3] = gaps_at(heights, samples, every, pose, here)
-            near_count = rows_within(here.gaps, every, pose[3] + around, near)
-            anchor[:] = pose
+        look = sideways_way(pose, anchor, lever) > limits.largest_mm or pose[3] > FAR_MM
     found[:] = pose
-    found[3] = gaps_at(heights, samples, every, pose, here)
     return step
 
 
 @compiled
-def sideways_way(pose: Float, other: Float, radius: float) -> float:
-    """How far sideways a point of the body gets between two poses, at half as far again as the lever."""
-    way: float = max(abs(pose[0] - other[0]), abs(pose[1] - other[1])) + 1.5 * radius * abs(pose[2] - other[2])
+def samples_below(samples: Float, gaps: Float, highest: float, out: Float) -> int:
+    """Write the samples whose gap is below a height; how many."""
+    count = 0
+    for k in range(samples.shape[0]):
+        if gaps[k] < highest:
+            out[count, 0], out[count, 1], out[count, 2] = samples[k, 0], samples[k, 1], samples[k, 2]
+            count += 1
+    return count
+
+
+@compiled
+def sideways_way(pose: Float, other: Float, lever: float) -> float:
+    """How far sideways a point of the body gets between two poses, at most."""
+    way: float = max(abs(pose[0] - other[0]), abs(pose[1] - other[1])) + lever * abs(pose[2] - other[2])
     return way
+
+
+@compiled
+def farthest(bins: Bins) -> float:
+    """How far from its origin any point of the moving body that faces along delta lies, in (x, y); at most."""
+    rows, columns = bins.cover.shape[:2]
+    x = max(-bins.x0, bins.x0 + columns * bins.size)
+    y = max(-bins.y0, bins.y0 + rows * bins.size)
+    lever: float = np.sqrt(x * x + y * y)
+    return lever

@@ -39,10 +39,10 @@ class SearchLimits(NamedTuple):
 
 
 #: Steps over the height map.
-SEARCH = SearchLimits(first_mm=0.5, largest_mm=1.0, last_mm=2e-2, radius_mm=30.0, gain_mm=1e-6, steepest=2.0, steps=200)
+SEARCH = SearchLimits(first_mm=0.5, largest_mm=1.0, last_mm=0.1, radius_mm=30.0, gain_mm=1e-6, steepest=2.0, steps=200)
 #: Steps over the exact features.
 POLISH = SearchLimits(
-    first_mm=0.03, largest_mm=0.06, last_mm=2e-3, radius_mm=30.0, gain_mm=1e-6, steepest=0.25, steps=20
+    first_mm=0.06, largest_mm=0.5, last_mm=2e-3, radius_mm=30.0, gain_mm=1e-6, steepest=2.0, steps=100
 )
 
 
@@ -73,11 +73,11 @@ class MapSettings:
     spacing_mm : float
         Between nodes of the map, and between samples of the moving body.
     window_mm : float
-        Half width of the square about the centre of the bounds that is mapped.
+        How far sideways a body may get from where a map was made before another is made.
     headroom_mm : float
-        What lies higher than this above the body at the centre of the bounds is left out, until a body gets that far.
+        What lies higher than this above the body is left out, until a body gets that far.
     """
 
     spacing_mm: float = 0.6
-    window_mm: float = 60.0
-    headroom_mm: float = 15.0
+    window_mm: float = 20.0
+    headroom_mm: float = 5.0

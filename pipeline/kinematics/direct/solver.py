@@ -8,7 +8,6 @@ both meshes, so that the pose is a maximum of the triangles themselves and its z
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -16,14 +15,17 @@ import numpy as np
 
 from pipeline.kinematics.cell import Certificate, ProofSettings, certificate
 from pipeline.kinematics.contact import Contacts, Pose
-from pipeline.kinematics.direct.features import clearances
+from pipeline.kinematics.direct.enclosure import enclosed
+from pipeline.kinematics.direct.features import triangles_over
+from pipeline.kinematics.direct.kernels import Climber, Kernels
 from pipeline.kinematics.direct.margin import margins
-from pipeline.kinematics.direct.polish import cells_near, depth_at, features_near, narrowed, polish
+from pipeline.kinematics.direct.polish import cells_near, depth_at, polish, rows_near
 from pipeline.kinematics.direct.prepare import DirectBodies
-from pipeline.kinematics.direct.search import new_rows, search
+from pipeline.kinematics.direct.search import search
 from pipeline.kinematics.direct.settings import DirectSettings, SearchLimits
 from pipeline.kinematics.direct.surfaces import FAR_MM, Attitude, Float
 from pipeline.kinematics.incremental import StablePose
+from pipeline.kinematics.joint_coordinates import attitude_rotation, rotation_z
 from pipeline.kinematics.ligaments import NO_FIBRES, Fibres, fibre_load
 from pipeline.kinematics.solvers import Margin
 from pipeline.kinematics.table import Status
@@ -32,20 +34,14 @@ from pipeline.kinematics.table import Status
 MARGIN_STEP = np.array([1.0, 1.0, np.radians(2.0)])
 
 
-class Kernels(NamedTuple):
-    """The three kernels of the solver: compiled, or :data:`pipeline.kinematics.direct.plain.PLAIN`."""
-
-    search: Callable[[Attitude, Float, SearchLimits, Float], int]
-    polish: Callable[[Attitude, Float, SearchLimits, Float], int]
-    depth_at: Callable[[Attitude, Float], float]
-
-
 COMPILED = Kernels(search, polish, depth_at)
 
 #: A pose is left this much short of exact contact, so that it is clear beyond rounding (mm).
 CLEAR_MM = 1e-4
-#: Farther than this from where a window was opened, another is opened (mm).
-WINDOW_MM = 20.0
+#: Where a start lay so much too deep, one body may have held the other (mm).
+PULLED_MM = 1.0
+#: Depths nearer than this are the same (mm).
+ROUNDING_MM = 1e-7
 #: Contacts on slopes up to 60 degrees are looked for: twice their distance along delta.
 BAND_ALONG = 2.0
 
@@ -107,32 +103,25 @@ class DirectAttitude:
             ``NO_CONTACT`` when nothing is met, ``SLID_OFF`` and ``ROTATION_BOUND`` when the body leaves the bounds,
             ``NOT_CONVERGED`` when the steps run out.
         """
-        settings, kernels = self.solver.settings, self.solver.kernels
-        mapped, steps = self._run(kernels.search, start, settings.search)
-        if mapped is None:
-            return StablePose(start, Status.SLID_OFF if steps else Status.NO_CONTACT, steps, 0)
-        found, more = self._run(kernels.polish, mapped, settings.polish)
+        found, steps, ended = self._climb(start)
+        if (found is None or found.z < start.z - PULLED_MM) and self._enclosed(start):
+            return StablePose(start, Status.NO_CONTACT, steps, 0)
         if found is None:
-            return StablePose(start, Status.SLID_OFF, steps + more, 0)
-        found = found._replace(z=found.z - CLEAR_MM)
-        status = _out_of_bounds(found, centre or start._replace(z=found.z), settings)
-        if status is None:
-            status = Status.NOT_CONVERGED if steps >= settings.search.steps else Status.OK
-        return StablePose(found, status, steps + more, 0)
+            return StablePose(start, Status.SLID_OFF if steps else Status.NO_CONTACT, steps, 0)
+        status = _out_of_bounds(found, centre or start._replace(z=found.z), self.solver.settings)
+        return StablePose(found, status or (Status.OK if ended else Status.NOT_CONVERGED), steps, 0)
 
     def depth(self, pose: Pose) -> Pose | None:
         """The pose brought to contact along delta (just clear of it); None where nothing is met."""
-        z = self.solver.kernels.depth_at(self._surfaces_at(pose), _array(pose))
+        z = self._depth(pose)
         return None if z > FAR_MM else pose._replace(z=z - CLEAR_MM)
 
     def contacts(self, pose: Pose, band_mm: float) -> Contacts:
         """Features within ``band_mm`` that meet along delta, at a pose just clear of contact; attitude frame."""
         attitude, place = self._surfaces_at(pose), _array(pose)
         active = cells_near(attitude, place, BAND_ALONG * band_mm + self.solver.settings.polish.slack_mm)
-        attitude = narrowed(attitude, place, active)
-        features, _ = features_near(attitude, place, np.array([0.0, BAND_ALONG * band_mm]), active)
-        rows = new_rows(len(features))
-        clearances(attitude, features, place, rows)
+        among = triangles_over(attitude, active, place, FAR_MM, 0.0)
+        rows = rows_near(attitude, active, among, place, BAND_ALONG * band_mm)
         slopes = rows.rates[:, :2]
         cosine = 1.0 / np.sqrt(1.0 + np.einsum("ij,ij->i", slopes, slopes))
         gaps = (rows.gaps - pose.z) * cosine
@@ -153,34 +142,72 @@ class DirectAttitude:
         margins(self._map_about(pose), _array(pose), MARGIN_STEP, out)
         return Margin(float(out[0]), float(out[1]), float(np.degrees(out[2])))
 
-    def _run(
-        self, kernel: Callable[[Attitude, Float, SearchLimits, Float], int], start: Pose, limits: SearchLimits
-    ) -> tuple[Pose | None, int]:
+    def _climb(self, start: Pose) -> Climb:
+        """Over the height map, then over the triangles; a second time over all of them where some were overlooked."""
+        kernels, settings = self.solver.kernels, self.solver.settings
+        best = self._run(kernels.search, start, settings.search)
+        if best.pose is None:
+            return best
+        found = self._run(kernels.polish, best.pose, settings.polish)
+        if found.pose is None or self._depth(found.pose) < found.pose.z - ROUNDING_MM:
+            found = self._run(kernels.polish, found.pose or best.pose, settings.polish._replace(slack_mm=np.inf))
+        clear = found.pose and found.pose._replace(z=found.pose.z - CLEAR_MM)
+        return Climb(clear, best.steps + found.steps, best.ended and found.ended)
+
+    def _run(self, kernel: Climber, start: Pose, limits: SearchLimits) -> Climb:
         attitude, found = self._map_about(start), np.empty(4)
         steps = kernel(attitude, _array(start), limits, found)
-        if found[3] + self.solver.bodies.bins.highest > attitude.ceiling_mm:
-            # it got to where the reference was left out: now with all of it
+        if found[3] + self._highest > attitude.ceiling_mm:
+            # what was left out may be met first
             self._mapped = self.solver.bodies.at(self._angles_rad, start._replace(z=np.inf), self.solver.fibres), start
             return self._run(kernel, start, limits)
-        return (None if found[3] > FAR_MM else _pose(found)), steps
+        return Climb(None if found[3] > FAR_MM else _pose(found), steps, steps < limits.steps)
+
+    def _depth(self, pose: Pose) -> float:
+        """Exact depth at a pose, more than ``FAR_MM`` where nothing is met."""
+        depth_at, near = self.solver.kernels.depth_at, self._surfaces_at(pose)
+        z = depth_at(near, _array(pose))
+        return z if z + self._highest <= near.ceiling_mm else depth_at(self._complete(), _array(pose))
+
+    def _enclosed(self, pose: Pose) -> bool:
+        bodies, to_reference = self.solver.bodies, attitude_rotation(*self._angles_rad)
+        shift = to_reference @ np.array([pose.x, pose.y, pose.z])
+        return enclosed(*bodies.hulls, to_reference @ rotation_z(pose.theta), shift)
 
     def _map_about(self, pose: Pose) -> Attitude:
-        if self._mapped is None or np.hypot(*np.subtract(pose, self._mapped[1])[:2]) > WINDOW_MM:
+        window_mm = self.solver.bodies.settings.window_mm
+        if self._mapped is None or np.hypot(*np.subtract(pose, self._mapped[1])[:2]) > window_mm:
             self._mapped = self.solver.bodies.at(self._angles_rad, pose, self.solver.fibres), pose
         return self._mapped[0]
 
     def _surfaces_at(self, pose: Pose) -> Attitude:
         """Both surfaces, complete about the height of a pose."""
-        if self._mapped is not None and pose.z + self.solver.bodies.bins.highest + 1.0 < self._mapped[0].ceiling_mm:
+        if self._mapped is not None and pose.z + self._highest + 1.0 < self._mapped[0].ceiling_mm:
             return self._mapped[0]
+        return self._complete()
+
+    def _complete(self) -> Attitude:
+        """Both surfaces, all of them, without a map."""
         if self._whole is None:
             self._whole = self.solver.bodies.turned(self._angles_rad, self.solver.fibres)
         return self._whole
 
+    @property
+    def _highest(self) -> float:
+        return self.solver.bodies.bins.highest
+
+
+class Climb(NamedTuple):
+    """What a climb came to: the pose, None where the body is lost; its steps; whether it ended before they ran out."""
+
+    pose: Pose | None
+    steps: int
+    ended: bool
+
 
 def _array(pose: Pose) -> Float:
     """x, y, theta, z: the order of the kernels."""
-    return np.array([pose.x, pose.y, pose.theta, pose.z])
+    return np.array([pose.x, pose.y, pose.theta, pose.z], dtype=np.float64)
 
 
 def _pose(found: Float) -> Pose:

@@ -11,12 +11,20 @@ from pipeline.kinematics.ligaments import Fibres
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int32]
+Bits = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
 
 #: Height of "nothing here", and what is certainly none (mm).
 NOTHING_MM = 1e9
 FAR_MM = 1e8
+#: What is steeper than this is a wall: its lower edge, which a face below it shares, is met instead.
+STEEPEST = 1e6
 #: Barycentric share by which a point may lie outside a triangle: points above shared edges belong to both.
 SHARED = 1e-9
+
+
+#: So many cells around a cell count for its peak: a triangle that reaches no farther is ruled out by one look.
+PEAK_CELLS = 2
 
 
 class HeightMap(NamedTuple):
@@ -36,7 +44,26 @@ class HeightMap(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """Triangles of one body with their edges numbered.
+    """Triangles of one body that may be met.
+
+    Attributes
+    ----------
+    points : (N, 3) float64
+        mm.
+    triangles : (M, 3) int32
+        Counter-clockwise from outside.
+    owned : (M,) uint8
+        Which corners (bits 0..2) and edges from corner k to corner k + 1 (bits 3..5) count as this triangle's, so that
+        each counts once.
+    """
+
+    points: Float
+    triangles: Int
+    owned: Bits
+
+
+class Body(NamedTuple):
+    """A whole body, its triangles in an order in which neighbours stand together.
 
     Attributes
     ----------
@@ -47,12 +74,18 @@ class Surface(NamedTuple):
     edges : (M, 3) int32
         Number of the edge from corner k to corner k + 1; shared by the triangles on both sides.
     edge_count : int
+    blocks : (B + 1,) int32
+        Block ``b`` is ``triangles[blocks[b]:blocks[b + 1]]``.
+    spheres : (B, 4) float64
+        A centre and a radius (mm) that hold the triangles of each block.
     """
 
     points: Float
     triangles: Int
     edges: Int
     edge_count: int
+    blocks: Int
+    spheres: Float
 
 
 class Bins(NamedTuple):
@@ -66,6 +99,8 @@ class Bins(NamedTuple):
         Cell ``c = j * NX + i`` holds ``items[start[c]:start[c + 1]]``.
     items : (K,) int32
         Which of the facing triangles.
+    spans : (K, 5) float64
+        Least x and y, greatest x, y and z of each item.
     triangles : (F,) int32
         Index of each facing triangle in the body.
     facing : (F, 9) float64
@@ -82,6 +117,7 @@ class Bins(NamedTuple):
     size: float
     start: Int
     items: Int
+    spans: Float
     triangles: Int
     facing: Float
     cover: Float
@@ -113,6 +149,8 @@ class Attitude(NamedTuple):
     ----------
     reference : Surface
         Points in the attitude frame; only triangles that face against delta.
+    spots : (M, 4) float64
+        Of each of these triangles: x and y of a point, how far from it the triangle reaches in (x, y), its least z.
     moving : Surface
         Points in the moving frame (z is delta).
     bins : Bins
@@ -129,6 +167,7 @@ class Attitude(NamedTuple):
     """
 
     reference: Surface
+    spots: Float
     moving: Surface
     bins: Bins
     samples: Float

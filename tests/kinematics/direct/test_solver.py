@@ -12,10 +12,11 @@ from pipeline.adapters.threads import map_threads
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.geometry.validation_objects import BallInDish, BarOnPyramids, ball, dish
 from pipeline.kinematics.contact import AttitudeContact, Pose
+from pipeline.kinematics.direct.kernels import Kernels
 from pipeline.kinematics.direct.plain import PLAIN
 from pipeline.kinematics.direct.prepare import prepare
 from pipeline.kinematics.direct.settings import DirectSettings
-from pipeline.kinematics.direct.solver import COMPILED, DirectSolver, Kernels
+from pipeline.kinematics.direct.solver import COMPILED, DirectSolver
 from pipeline.kinematics.incremental import StablePose, solve_incremental
 from pipeline.kinematics.joint_coordinates import rotation_x
 from pipeline.kinematics.table import Status
