@@ -10,7 +10,7 @@ from both sides (see :mod:`pipeline.kinematics.jumps`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,9 @@ from pipeline.kinematics.table import Float, Grid, PoseTable, RawTable, Status
 
 Place = tuple[int, int]
 
+#: So many cells of the spine are walked at a time.
+STRETCH = 24
+
 
 class Walk(NamedTuple):
     """A walk over neighbouring cells: their (row, column) and their (flexion, varus) in degrees, and the start.
@@ -34,6 +37,14 @@ class Walk(NamedTuple):
     attitudes_deg: tuple[tuple[float, float], ...]
     start: Pose
     centre: Pose
+
+    def between(self, first: int, last: int) -> Walk:
+        """The walk over some of the cells only."""
+        return self._replace(cells=self.cells[first:last], attitudes_deg=self.attitudes_deg[first:last])
+
+    def after(self, walked: Walked, count: int) -> Walk:
+        """What is left of the walk when its first cells have been walked."""
+        return self.between(count, len(self.cells))._replace(start=walked.end(self.start))
 
 
 class Release(NamedTuple):
@@ -65,6 +76,11 @@ class Walked(NamedTuple):
     cells: tuple[Place, ...]
     found: tuple[Found, ...]
 
+    def end(self, start: Pose) -> Pose:
+        """The last usable pose, or the start."""
+        poses = [one.stable.pose for one in self.found if one.stable.status.usable]
+        return poses[-1] if poses else start
+
 
 class Ways(NamedTuple):
     """What was found on the ways out, which reach every cell, and on the way back over the spine."""
@@ -74,9 +90,9 @@ class Ways(NamedTuple):
 
 
 def walk_grid(
-    grid: Grid, scan_deg: tuple[float, float], scan: Pose, walk: Callable[[Sequence[Walk]], Sequence[Walked]]
+    grid: Grid, scan_deg: tuple[float, float], scan: Pose, walk: Callable[[Sequence[Walk]], list[Walked]]
 ) -> Ways:
-    """Walk the spine, then the ribs and the way back.
+    """Walk the spine by stretches, and beside each the ribs of the stretch before; the way back at the end.
 
     Parameters
     ----------
@@ -89,10 +105,24 @@ def walk_grid(
         Makes the walks given, which do not depend on one another.
     """
     first = spine(grid, scan_deg[0], scan_deg[1], scan)
-    along = tuple(walk(first))
+    ahead, along = first, tuple(Walked((), ()) for _ in first)
+    out, ready, begun = list[Walked](), tuple[Walk, ...](), set[int]()
+    while any(one.cells for one in ahead):
+        stretches = tuple(one.between(0, STRETCH) for one in ahead)
+        results = walk((*stretches, *ready))
+        out += results[len(ahead) :]
+        done = results[: len(ahead)]
+        ahead = tuple(one.after(new, STRETCH) for one, new in zip(ahead, done, strict=True))
+        along = tuple(
+            Walked(old.cells + new.cells, old.found + new.found) for old, new in zip(along, done, strict=True)
+        )
+        rows = {
+            at[0] for one in done for at, found in zip(one.cells, one.found, strict=True) if found.stable.status.usable
+        }
+        ready, begun = ribs(grid, along, scan, rows), begun | rows
     returns = way_back(first, along)
-    rest = tuple(walk((*returns, *ribs(grid, along, scan))))
-    return Ways((*along, *rest[len(returns) :]), rest[: len(returns)])
+    rest = walk((*returns, *ready, *ribs(grid, along, scan, set(range(grid.shape[0])) - begun)))
+    return Ways((*along, *out, *rest[len(returns) :]), tuple(rest[: len(returns)]))
 
 
 def spine(grid: Grid, scan_flexion_deg: float, scan_varus_deg: float, scan: Pose) -> tuple[Walk, ...]:
@@ -112,19 +142,17 @@ def spine(grid: Grid, scan_flexion_deg: float, scan_varus_deg: float, scan: Pose
     return tuple(sorted(walks, key=lambda walk: -len(walk.cells)))
 
 
-def ribs(grid: Grid, spine_walked: Sequence[Walked], scan: Pose) -> tuple[Walk, ...]:
-    """Walks along varus from every cell of the spine, to either side.
+def ribs(grid: Grid, along: Sequence[Walked], scan: Pose, rows: Iterable[int]) -> tuple[Walk, ...]:
+    """Walks along varus from the cells of the spine in some rows, to either side.
 
     A rib whose own cell of the spine failed starts from the nearest row that did not; none can start where all failed.
     """
-    starts = {
-        at: one.stable.pose for at, one in kept(Ways(tuple(spine_walked), ())).items() if one.stable.status.usable
-    }
+    starts = {at: one.stable.pose for at, one in _by_cell(along).items() if one.stable.status.usable}
     if not starts:
         return ()
     column = next(iter(starts))[1]
     walks = []
-    for row in range(grid.shape[0]):
+    for row in sorted(rows):
         start = starts[min(starts, key=lambda at: (abs(at[0] - row), at[0]))]
         for way in (range(column + 1, grid.shape[1]), range(column - 1, -1, -1)):
             if way:
@@ -134,13 +162,8 @@ def ribs(grid: Grid, spine_walked: Sequence[Walked], scan: Pose) -> tuple[Walk, 
 
 def way_back(walks: Sequence[Walk], walked: Sequence[Walked]) -> tuple[Walk, ...]:
     """Each walk from its end to its beginning, started from the last usable pose."""
-
-    def end(walk: Walk, one: Walked) -> Pose:
-        poses = [found.stable.pose for found in one.found if found.stable.status.usable]
-        return poses[-1] if poses else walk.start
-
     return tuple(
-        Walk(walk.cells[::-1], walk.attitudes_deg[::-1], end(walk, one), walk.centre)
+        Walk(walk.cells[::-1], walk.attitudes_deg[::-1], one.end(walk.start), walk.centre)
         for walk, one in zip(walks, walked, strict=True)
     )
 

@@ -73,7 +73,7 @@ def cells_of(*walks: Walk) -> list[Place]:
 @pytest.mark.parametrize("varus_deg", [0.3, -9.0, 2.0])
 def test_spine_and_ribs_cover_every_cell_once(flexion_deg: float, varus_deg: float) -> None:
     along = spine(GRID, flexion_deg, varus_deg, SCAN)
-    across = ribs(GRID, [walked(walk) for walk in along], SCAN)
+    across = ribs(GRID, [walked(walk) for walk in along], SCAN, range(7))
     assert sorted(cells_of(*along, *across)) == sorted(np.ndindex(GRID.shape))
 
 
@@ -92,7 +92,7 @@ def test_the_spine_leaves_the_scan_both_ways_at_the_varus_nearest_to_it(flexion_
 
 def test_every_walk_goes_from_neighbour_to_neighbour_at_the_attitudes_of_its_cells() -> None:
     along = spine(GRID, 21.0, 0.0, SCAN)
-    for walk in (*along, *ribs(GRID, [walked(one) for one in along], SCAN)):
+    for walk in (*along, *ribs(GRID, [walked(one) for one in along], SCAN, range(7))):
         steps = np.abs(np.diff(walk.cells, axis=0)).sum(axis=1)
         np.testing.assert_array_equal(steps, 1)
         expected = [(GRID.flexion_deg[row], GRID.varus_deg[column]) for row, column in walk.cells]
@@ -109,23 +109,41 @@ def test_the_spine_is_walked_back_from_its_last_usable_pose() -> None:
     assert lost_way.start == SCAN
 
 
-def test_a_grid_is_walked_in_two_rounds_and_every_way_is_told_apart() -> None:
-    rounds: list[list[Walk]] = []
+@pytest.mark.parametrize("stretch", [1, 2, 24])
+@pytest.mark.parametrize("failed", [frozenset[int](), frozenset({2, 3, 6}), frozenset(range(7))])
+def test_a_grid_is_walked_the_same_way_by_stretches_of_any_length(
+    monkeypatch: pytest.MonkeyPatch, stretch: int, failed: frozenset[int]
+) -> None:
+    monkeypatch.setattr("pipeline.kinematics.sweep.STRETCH", stretch)
+    begun: list[Walk] = []
 
     def walk(walks: Sequence[Walk]) -> list[Walked]:
-        rounds.append(list(walks))
-        return [walked(one) for one in walks]
+        begun.extend(walks)
+        return [walked(one, failed) for one in walks]
 
     ways = walk_grid(GRID, (21.0, 0.0), SCAN, walk)
-    assert rounds[0] == list(spine(GRID, 21.0, 0.0, SCAN))
-    assert rounds[1][:2] == list(way_back(rounds[0], [walked(one) for one in rounds[0]]))
-    assert sorted(at for one in ways.out for at in one.cells) == sorted(np.ndindex(GRID.shape))
-    assert [one.cells for one in ways.back] == [one.cells[::-1] for one in rounds[0]]
+    along = spine(GRID, 21.0, 0.0, SCAN)
+    whole = [walked(one, failed) for one in along]
+    across = ribs(GRID, whole, SCAN, range(7))
+    assert [one.cells for one in ways.out[:2]] == [one.cells for one in along]
+    assert sorted(one.cells for one in ways.out[2:]) == sorted(one.cells for one in across)
+    assert {one.cells: one.start for one in begun if one in across} == {one.cells: one.start for one in across}
+    assert [one.cells for one in ways.back] == [one.cells[::-1] for one in along]
+    assert list(way_back(along, whole)) == [one for one in begun if one in way_back(along, whole)][-2:]
+
+
+def test_a_stretch_starts_where_the_one_before_it_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.kinematics.sweep.STRETCH", 2)
+    solver = Deeper(failing=frozenset({2}))
+    grid = Grid(np.arange(5.0), np.array([0.0]))
+    ways = walk_grid(grid, (0.0, 0.0), SCAN, lambda walks: [go(solver, one) for one in walks])
+    assert [one.start.z for one in ways.out[0].found] == [5.0, 6.0, 6.0, 7.0, 8.0]
+    assert [one.start.z for one in ways.back[0].found] == [9.0, 10.0, 11.0, 12.0, 13.0]
 
 
 def test_a_rib_starts_from_its_own_cell_of_the_spine_and_is_bound_about_the_scan() -> None:
     along = spine(GRID, 21.0, 0.0, SCAN)
-    for walk in ribs(GRID, [walked(one) for one in along], SCAN):
+    for walk in ribs(GRID, [walked(one) for one in along], SCAN, range(7)):
         assert walk.start.z == GRID.flexion_deg[walk.cells[0][0]]
         assert walk.cells[0][1] in (1, 3)
         assert walk.centre == SCAN
@@ -133,7 +151,7 @@ def test_a_rib_starts_from_its_own_cell_of_the_spine_and_is_bound_about_the_scan
 
 def test_a_rib_of_a_failed_cell_starts_from_the_nearest_row_that_did_not_fail() -> None:
     along = spine(GRID, 21.0, 0.0, SCAN)
-    across = ribs(GRID, [walked(one, frozenset({0, 1, 4})) for one in along], SCAN)
+    across = ribs(GRID, [walked(one, frozenset({0, 1, 4})) for one in along], SCAN, range(7))
     starts = {walk.cells[0][0]: walk.start.z for walk in across}
     assert starts == {0: 20.0, 1: 20.0, 2: 20.0, 3: 30.0, 4: 30.0, 5: 50.0, 6: 60.0}
 
@@ -141,7 +159,7 @@ def test_a_rib_of_a_failed_cell_starts_from_the_nearest_row_that_did_not_fail() 
 def test_without_a_spine_there_are_no_ribs_and_their_cells_stay_unreached() -> None:
     along = spine(GRID, 21.0, 0.0, SCAN)
     nothing = [walked(one, frozenset(range(7))) for one in along]
-    assert ribs(GRID, nothing, SCAN) == ()
+    assert ribs(GRID, nothing, SCAN, range(7)) == ()
     status = assembled(GRID, kept(Ways(tuple(nothing), ()))).poses.status
     np.testing.assert_array_equal(status[:, 2], Status.SLID_OFF)
     np.testing.assert_array_equal(status[:, [0, 1, 3]], Status.NOT_CONVERGED)
@@ -151,7 +169,7 @@ def test_a_grid_of_one_attitude_is_one_walk() -> None:
     grid = Grid(np.array([30.0]), np.array([1.0]))
     along = spine(grid, 8.0, -3.0, SCAN)
     assert [walk.cells for walk in along] == [((0, 0),)]
-    assert ribs(grid, [Walked(along[0].cells, (found(1.0),))], SCAN) == ()
+    assert ribs(grid, [Walked(along[0].cells, (found(1.0),))], SCAN, [0]) == ()
 
 
 def test_attitudes_are_those_of_the_grid() -> None:
@@ -284,7 +302,7 @@ def test_hysteresis_is_known_only_along_the_spine() -> None:
     along = spine(GRID, 21.0, 0.0, SCAN)
     out = [walked(one, frozenset({4})) for one in along]
     back = [Walked(one.cells[::-1], one.found[::-1]) for one in out]
-    across = [walked(one) for one in ribs(GRID, out, SCAN)]
+    across = [walked(one) for one in ribs(GRID, out, SCAN, range(7))]
     known = np.isfinite(hysteresis(GRID, Ways((*out, *across), tuple(back))).shift_mm)
     np.testing.assert_array_equal(np.argwhere(known), [(row, 2) for row in range(7) if row != 4])
 

@@ -23,7 +23,7 @@ from pipeline.kinematics.direct.surfaces import (
 #: Heights this near are the same, mm.
 ROUNDING_MM = 1e-9
 #: Features are wanted that lie up to so far above the depth (mm): those that the next step may meet.
-ABOVE_MM = 0.05
+ABOVE_MM = 0.03
 #: A promise of less than this times the trust region is none.
 FLAT = 1e-4
 #: Farther than this from where cells were chosen, they are chosen anew, mm.

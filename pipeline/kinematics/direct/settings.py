@@ -42,7 +42,7 @@ class SearchLimits(NamedTuple):
 SEARCH = SearchLimits(first_mm=0.5, largest_mm=1.0, last_mm=0.1, radius_mm=30.0, gain_mm=1e-6, steepest=2.0, steps=200)
 #: Steps over the exact features.
 POLISH = SearchLimits(
-    first_mm=0.06, largest_mm=0.5, last_mm=2e-3, radius_mm=30.0, gain_mm=1e-6, steepest=2.0, steps=100
+    first_mm=0.06, largest_mm=0.5, last_mm=2e-3, radius_mm=30.0, gain_mm=1e-6, steepest=2.0, steps=200
 )
 
 
@@ -80,4 +80,4 @@ class MapSettings:
 
     spacing_mm: float = 0.6
     window_mm: float = 20.0
-    headroom_mm: float = 5.0
+    headroom_mm: float = 3.0
