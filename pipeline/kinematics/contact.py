@@ -81,6 +81,11 @@ class Contacts:
     def __len__(self) -> int:
         return len(self.gaps)
 
+    def within(self, band_mm: float) -> Contacts:
+        """Those that are closer than a band."""
+        near = self.gaps <= band_mm
+        return Contacts(self.points[near], self.normals[near], self.gaps[near])
+
 
 class AttitudeContact:
     """The two bodies at one held attitude.

@@ -200,7 +200,8 @@ def go(solver: Solver, walk: Walk) -> Walked:
 def certified(solver: Solver, at: tuple[tuple[float, float], Pose]) -> Certified:
     """Certificate and margin of a stable pose at (flexion, varus) in degrees."""
     attitude = solver.at(angles_rad(at[0]))
-    return Certified(attitude.certify(at[1]), attitude.margin(at[1]))
+    margin = attitude.margin(at[1])  # first: what it prepares serves the certificate
+    return Certified(attitude.certify(at[1]), margin)
 
 
 def let_go(solver: Solver, release: Release) -> StablePose:

@@ -97,13 +97,20 @@ def lowest(rows: Rows) -> float:
 @compiled
 def depth_at(attitude: Attitude, pose: Float) -> float:
     """Exact depth at (x, y, theta, expected z): how far the body goes along delta; ``NOTHING_MM`` where for ever."""
-    every, ceiling, more = cells_near(attitude, pose, np.inf), pose[3] + ROUNDING_MM, FIRST_RISE_MM
+    ceiling, more = pose[3] + ROUNDING_MM, FIRST_RISE_MM
     while True:
-        among = triangles_over(attitude, every, pose, ceiling, 0.0)
-        least = lowest(rows_of(attitude, near_pairs(attitude, every, among, pose, ceiling), pose, ceiling))
+        least = lowest(rows_below(attitude, pose, ceiling))
         if least <= ceiling or ceiling > FAR_MM:
             return least
         ceiling, more = ceiling + more, 4.0 * more
+
+
+@compiled
+def rows_below(attitude: Attitude, pose: Float, ceiling: float) -> Rows:
+    """Every feature that is there at (x, y, theta) with a clearance up to a ceiling, wherever it lies."""
+    every = np.ones(attitude.bins.cover.shape[:2], np.bool_)
+    among = triangles_over(attitude, every, pose, ceiling, 0.0)
+    return rows_of(attitude, near_pairs(attitude, every, among, pose, ceiling), pose, ceiling)
 
 
 @compiled

@@ -91,9 +91,11 @@ class DirectBodies:
         rasterise(turned.reference.points, turned.reference.triangles, heights)
         return turned._replace(heights=heights)
 
-    def turned(self, angles_rad: tuple[float, float], fibres: Fibres = NO_FIBRES) -> Attitude:
-        """The pair at flexion and varus without a height map: enough for exact depths and contacts."""
-        return self._turned(angles_rad, np.inf, fibres)[0]
+    def turned(
+        self, angles_rad: tuple[float, float], ceiling_mm: float = np.inf, fibres: Fibres = NO_FIBRES
+    ) -> Attitude:
+        """The pair at flexion and varus without a height map: enough for exact depths and contacts below a ceiling."""
+        return self._turned(angles_rad, ceiling_mm, fibres)[0]
 
     def _turned(self, angles_rad: tuple[float, float], ceiling_mm: float, fibres: Fibres) -> tuple[Attitude, Float]:
         """The pair without a map, and least x, y and greatest x, y of what faces the moving body."""

@@ -16,10 +16,9 @@ import numpy as np
 from pipeline.kinematics.cell import Certificate, ProofSettings, certificate
 from pipeline.kinematics.contact import Contacts, Pose
 from pipeline.kinematics.direct.enclosure import enclosed
-from pipeline.kinematics.direct.features import triangles_over
 from pipeline.kinematics.direct.kernels import Climber, Kernels
 from pipeline.kinematics.direct.margin import margins
-from pipeline.kinematics.direct.polish import cells_near, depth_at, polish, rows_near
+from pipeline.kinematics.direct.polish import depth_at, polish, rows_below
 from pipeline.kinematics.direct.prepare import DirectBodies
 from pipeline.kinematics.direct.search import search
 from pipeline.kinematics.direct.settings import DirectSettings, SearchLimits
@@ -84,7 +83,7 @@ class DirectAttitude:
     def __init__(self, solver: DirectSolver, angles_rad: tuple[float, float]) -> None:
         self.solver = solver
         self._angles_rad = angles_rad
-        self._whole: Attitude | None = None
+        self._bare: Attitude | None = None
         self._mapped: tuple[Attitude, Pose] | None = None
 
     def solve(self, start: Pose, centre: Pose | None = None) -> StablePose:
@@ -119,9 +118,7 @@ class DirectAttitude:
     def contacts(self, pose: Pose, band_mm: float) -> Contacts:
         """Features within ``band_mm`` that meet along delta, at a pose just clear of contact; attitude frame."""
         attitude, place = self._surfaces_at(pose), _array(pose)
-        active = cells_near(attitude, place, BAND_ALONG * band_mm + self.solver.settings.polish.slack_mm)
-        among = triangles_over(attitude, active, place, FAR_MM, 0.0)
-        rows = rows_near(attitude, active, among, place, BAND_ALONG * band_mm)
+        rows = rows_below(attitude, place, pose.z + BAND_ALONG * band_mm)
         slopes = rows.rates[:, :2]
         cosine = 1.0 / np.sqrt(1.0 + np.einsum("ij,ij->i", slopes, slopes))
         gaps = (rows.gaps - pose.z) * cosine
@@ -167,7 +164,11 @@ class DirectAttitude:
         """Exact depth at a pose, more than ``FAR_MM`` where nothing is met."""
         depth_at, near = self.solver.kernels.depth_at, self._surfaces_at(pose)
         z = depth_at(near, _array(pose))
-        return z if z + self._highest <= near.ceiling_mm else depth_at(self._complete(), _array(pose))
+        return (
+            z
+            if z + self._highest <= near.ceiling_mm
+            else depth_at(self._surfaces_at(pose._replace(z=np.inf)), _array(pose))
+        )
 
     def _enclosed(self, pose: Pose) -> bool:
         bodies, to_reference = self.solver.bodies, attitude_rotation(*self._angles_rad)
@@ -182,15 +183,13 @@ class DirectAttitude:
 
     def _surfaces_at(self, pose: Pose) -> Attitude:
         """Both surfaces, complete about the height of a pose."""
-        if self._mapped is not None and pose.z + self._highest + 1.0 < self._mapped[0].ceiling_mm:
+        needed = pose.z + self._highest + 1.0
+        if self._mapped is not None and needed < self._mapped[0].ceiling_mm:
             return self._mapped[0]
-        return self._complete()
-
-    def _complete(self) -> Attitude:
-        """Both surfaces, all of them, without a map."""
-        if self._whole is None:
-            self._whole = self.solver.bodies.turned(self._angles_rad, self.solver.fibres)
-        return self._whole
+        if self._bare is None or needed >= self._bare.ceiling_mm:
+            ceiling = needed + self.solver.bodies.settings.headroom_mm
+            self._bare = self.solver.bodies.turned(self._angles_rad, ceiling, self.solver.fibres)
+        return self._bare
 
     @property
     def _highest(self) -> float:
