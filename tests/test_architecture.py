@@ -21,7 +21,19 @@ each_stage = pytest.mark.parametrize("stage", FLOW, ids=[stage.name for stage in
 
 PURE = ("geometry", "kinematics")
 #: Compiled libraries that fail silently: wrapped once, where their failures become exceptions.
-WRAPPED = {"vtk", "vtkmodules", "pyvista", "trimesh", "fcl", "cv2", "h5py", "meshio", "SimpleITK", "nibabel", "nrrd"}
+WRAPPED = {
+    "vtk",
+    "vtkmodules",
+    "fast_simplification",
+    "trimesh",
+    "fcl",
+    "cv2",
+    "h5py",
+    "meshio",
+    "SimpleITK",
+    "nibabel",
+    "nrrd",
+}
 #: What maths may not see: paths, settings, logs, processes, the wrapped libraries.
 IMPURE = WRAPPED | {
     "pathlib",

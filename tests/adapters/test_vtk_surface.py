@@ -9,13 +9,12 @@ from vtkmodules.vtkFiltersCore import vtkQuadricDecimation
 
 from pipeline.adapters.vtk_surface import (
     VtkError,
-    decimate_quadric,
     label_surface,
     smooth_windowed_sinc,
     vtk_errors_raised,
 )
 from pipeline.geometry.mesh import TriangleMesh, check_closed, components, volume_mm3
-from tests.geometry.meshes import ball, centred, octahedron, torus
+from tests.geometry.meshes import ball, centred, octahedron
 
 UNIT = np.eye(4)
 
@@ -62,12 +61,6 @@ def test_smoothing_keeps_volume_and_connectivity() -> None:
     assert errors[1] < 0.3 * errors[0]
 
 
-def test_decimation_reaches_its_number() -> None:
-    light = decimate_quadric(torus(10.0, 3.0, 60, 40), 1000)
-    check_closed(light, "light")
-    assert abs(len(light.triangles) - 1000) <= 2
-
-
 def _octahedron_with(points: float | None = None, corner: int | None = None) -> TriangleMesh:
     mesh = octahedron()
     changed, triangles = mesh.points.copy(), mesh.triangles.copy()
@@ -90,8 +83,6 @@ def _octahedron_with(points: float | None = None, corner: int | None = None) -> 
 def test_what_would_crash_vtk_never_reaches_it(mesh: TriangleMesh, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         smooth_windowed_sinc(mesh, 10, 0.1)
-    with pytest.raises(ValueError, match=message):
-        decimate_quadric(mesh, 4)
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (3, 3, 3)])

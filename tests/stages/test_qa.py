@@ -109,7 +109,7 @@ def test_settings_read_as_a_protocol_gives_them() -> None:
 
 
 def test_a_run_from_the_cache_loads_no_library_that_draws() -> None:
-    heavy = ("vtk", "vtkmodules", "pyvista", "matplotlib", "cv2", "jinja2")
+    heavy = ("vtk", "vtkmodules", "fast_simplification", "matplotlib", "cv2", "jinja2")
     code = f"import sys, pipeline.stages.qa; print([n for n in {heavy} if n in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
