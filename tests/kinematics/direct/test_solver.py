@@ -10,7 +10,7 @@ import pytest
 from pipeline.adapters.fcl_contact import FclBodies
 from pipeline.adapters.threads import map_threads
 from pipeline.geometry.mesh import TriangleMesh
-from pipeline.geometry.validation_objects import BallInDish, BarOnPyramids, ball, dish
+from pipeline.geometry.validation_objects import BallInDish, BarOnPyramids, ball, box, dish
 from pipeline.kinematics.contact import AttitudeContact, Pose
 from pipeline.kinematics.direct.kernels import Kernels
 from pipeline.kinematics.direct.plain import PLAIN
@@ -21,7 +21,7 @@ from pipeline.kinematics.incremental import StablePose, solve_incremental
 from pipeline.kinematics.joint_coordinates import rotation_x
 from pipeline.kinematics.table import Status
 from tests.kinematics.settings import BALL_STARTS, BAR_STARTS, PAPER
-from tests.kinematics.shapes import ellipsoid, joined, shifted, turned_down
+from tests.kinematics.shapes import ellipsoid, groove, joined, shifted, turned_down
 
 LEVEL = (0.0, 0.0)
 
@@ -134,3 +134,27 @@ def test_margin_of_a_ball_in_its_dish_reaches_the_most_that_is_tried(bowl: Direc
     margin = attitude.margin(attitude.solve(BALL_STARTS[0]).pose)
     assert (margin.lateral_mm, margin.anterior_mm) == (5.0, 5.0)
     assert margin.rotation_deg == pytest.approx(10.0)
+
+
+@each_kernel
+@pytest.mark.parametrize("held", [False, True], ids=["moving body inside", "reference inside"])
+def test_a_body_inside_the_other_meets_nothing(kernels: Kernels, held: bool) -> None:  # noqa: FBT001 - which is inside
+    bodies = [ellipsoid((20, 18, 15)), ellipsoid((4, 3, 2))]
+    nested = solver(*(bodies[::-1] if held else bodies))
+    start = Pose(0.5, -0.3, 0.2, 0.1)
+    assert replace(nested, kernels=kernels).at(LEVEL).solve(start).status is Status.NO_CONTACT
+
+
+@pytest.mark.parametrize("post_mm", [4.0, 9.0, 13.0])
+def test_a_body_that_slides_stops_where_a_post_hangs_down(post_mm: float) -> None:
+    """The post is lower than all that lies near contact where the body starts: it must be seen on the way."""
+    post = box((-1.0, 1.0), (post_mm, post_mm + 1.0), (-40.0, 0.0))
+    reference, moving = joined(groove(20.0), post), shifted(turned_down(ball(3.0)), z=-3.0)
+    slope, start = (0.2, 0.0), Pose(0.0, -6.0, -30.0, 0.0)
+    contact = AttitudeContact(FclBodies(reference, moving), *slope)
+    quick = solver(reference, moving).at(slope).solve(start)
+    slow = solve_incremental(contact, start, PAPER)
+    assert quick.status is slow.status
+    assert quick.pose.z >= slow.pose.z - 1e-3
+    assert not contact.touches(quick.pose)
+    assert contact.touches(quick.pose._replace(z=quick.pose.z + 5e-3))
