@@ -27,7 +27,7 @@ NUMBERS = FLOW[:6]
 
 #: A grid and meshes small enough for a test, coarse enough to be quick.
 COARSE = (
-    "contact.triangles=6000",
+    "contact.triangles=10000",
     "mesh.triangles_of={femur: 6000, tibia: 6000}",
     "mesh.triangles=3000",
     "mesh.volume_tolerance_fraction=0.08",
