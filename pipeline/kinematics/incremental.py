@@ -131,14 +131,6 @@ class _Search:
     last: Kind = "translation"
     motions: int = 0
     cycles: int = 0
-    near: tuple[Pose, Contacts] | None = None
-
-    def contacts(self) -> Contacts:
-        """Contacts at the pose, as far away as any rule asks for; looked for once at each pose."""
-        if self.near is None or self.near[0] != self.pose:
-            band = max(self.settings.contact_band_mm, self.settings.translation_resolution_mm)
-            self.near = self.pose, self.contact.contacts(self.pose, band, along_only=True)
-        return self.near[1]
 
     def finished(self, status: Status) -> StablePose:
         return StablePose(self.pose, status, self.motions, self.cycles)
@@ -228,7 +220,7 @@ def _try(search: _Search, kind: Kind, direction: Motion) -> tuple[Pose | None, b
 
 
 def _options(search: _Search) -> dict[Kind, list[Motion]]:
-    contacts = search.contacts().within(search.settings.contact_band_mm)
+    contacts = search.contact.contacts(search.pose, search.settings.contact_band_mm, along_only=True)
     return motion_options(contacts, search.pose, search.contact.load(search.pose))
 
 
@@ -290,7 +282,8 @@ def _unit_trials(search: _Search) -> list[Pose]:
 
 def _joint_trials(search: _Search) -> Iterator[Pose]:
     """Joint motions within boxes of halving size; the contacts that matter lie within half the box."""
-    p, near, box = search.pose, search.contacts(), 2.0 * search.settings.translation_resolution_mm
+    p, box = search.pose, 2.0 * search.settings.translation_resolution_mm
+    near = search.contact.contacts(p, 0.5 * box, along_only=True)
     while box >= search.settings.translation_resolution_mm / 8.0:
         contacts = near.within(0.5 * box)
         if len(contacts):
