@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import resource
 import sys
 import tempfile
 import time
@@ -25,6 +24,7 @@ from pipeline.kinematics.descent import drop
 from pipeline.playback import Lut
 from tests.bench import Figure, seconds, sweeps
 from tests.bench.knees import cases
+from tests.bench.memory import PeakMemory
 from tests.end_to_end.knee_runs import Silent
 
 REPORT = Path("build/bench.json")
@@ -85,18 +85,15 @@ def lookup_figures(lut: Lut) -> Iterator[Figure]:
     yield Figure("lookups_per_s", 1.0 / many, "1/s", f"{one / many:.0f} times one at a time")
 
 
-def peak_memory_mb() -> float:
-    """Of this process and its largest child."""
-    who = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    return max(resource.getrusage(one).ru_maxrss for one in who) / 1024.0
-
-
 def patient_and_queries(folder: Path) -> Iterator[Figure]:
     """The real knee from labels to package where it is present, else the phantom; then what it is made of."""
     _, case = list(cases(folder))[-1]
-    first, _, cached_s = patient(case, folder)
+    with PeakMemory() as memory:
+        first, _, cached_s = patient(case, folder)
     yield from patient_figures(first, cached_s)
-    yield Figure("peak_rss_mb", peak_memory_mb(), "MB", "largest of the processes of a patient")
+    yield Figure(
+        "peak_rss_mb", memory.peak_mb, "MB", "all processes of a patient together, what they share counted in each"
+    )
     yield from contact_figures(folder / "results")
     yield from lookup_figures(Lut.open(folder / "results" / "90_package" / "lut.h5"))
 
@@ -106,7 +103,7 @@ def main() -> None:
     measured = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for figure in chain(patient_and_queries(folder), sweeps.figures(folder)):
+        for figure in chain(patient_and_queries(folder / "patient"), sweeps.figures(folder / "sweeps")):
             measured[figure.name] = figure.value
             sys.stdout.write(f"{figure.name:<38}{figure.value:>12.4g} {figure.unit:<5}{figure.ratio}\n")
             sys.stdout.flush()
