@@ -25,7 +25,7 @@ ROUNDING_MM = 1e-9
 #: Features are wanted that lie up to so far above the depth (mm): those that the next step may meet.
 ABOVE_MM = 0.03
 #: A promise of less than this times the trust region is none.
-FLAT = 1e-4
+FLAT = 5e-4
 #: Farther than this from where cells were chosen, they are chosen anew, mm.
 AWAY_MM = 0.5
 #: Where nothing is found, the search for features goes up by so much first.
