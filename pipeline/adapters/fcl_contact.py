@@ -46,6 +46,7 @@ class FclBodies:
         self._fixed = fcl.CollisionObject(_hierarchy(reference), fcl.Transform())
         self._placed = fcl.CollisionObject(_hierarchy(moving), fcl.Transform())
         self._compartments = _compartments(moving, eminence_mm)
+        self._proper: Float | None = None
         self._yes_no = fcl.CollisionRequest(num_max_contacts=1, enable_contact=False)
         self._all = fcl.CollisionRequest(num_max_contacts=MAX_PAIRS, enable_contact=True)
 
@@ -68,18 +69,21 @@ class FclBodies:
         part = self._compartments[compartment]
         if part is None:
             return float("nan")
-        part.setTransform(_transform(rotation, shift))
+        part.setTransform(self._transform(rotation, shift))
         return max(float(fcl.distance(self._fixed, part, fcl.DistanceRequest(), fcl.DistanceResult())), 0.0)
 
     def _place(self, rotation: Float, shift: Float) -> None:
-        self._placed.setTransform(_transform(rotation, shift))
+        self._placed.setTransform(self._transform(rotation, shift))
 
-
-def _transform(rotation: Float, shift: Float) -> fcl.Transform:
-    askew = np.abs(rotation @ rotation.T - _UNIT).max()
-    if not (askew < 1e-9 and np.linalg.det(rotation) > 0.0 and np.isfinite(shift).all()):
-        raise ValueError("a placement is a proper rotation (3, 3) and a finite shift (3,)")
-    return fcl.Transform(rotation, shift)
+    def _transform(self, rotation: Float, shift: Float) -> fcl.Transform:
+        if rotation is not self._proper:  # one that nobody can write is looked at once
+            askew = np.abs(rotation @ rotation.T - _UNIT).max()
+            if not (askew < 1e-9 and np.linalg.det(rotation) > 0.0):
+                raise ValueError("a placement is a proper rotation (3, 3) and a finite shift (3,)")
+            self._proper = None if rotation.flags.writeable else rotation
+        if not np.isfinite(shift).all():
+            raise ValueError("a placement is a proper rotation (3, 3) and a finite shift (3,)")
+        return fcl.Transform(rotation, shift)
 
 
 def _compartments(moving: TriangleMesh, eminence_mm: float) -> dict[Compartment, fcl.CollisionObject | None]:

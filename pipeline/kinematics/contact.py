@@ -101,6 +101,7 @@ class AttitudeContact:
     def __init__(self, bodies: Bodies, flexion_rad: float, varus_rad: float, fibres: Fibres = NO_FIBRES) -> None:
         self.bodies = bodies
         self._reference_from_attitude = attitude_rotation(flexion_rad, varus_rad)
+        self._turned = 0.0, self._reference_from_attitude
         self._fibres = fibres._replace(on_reference=fibres.on_reference @ self._reference_from_attitude)
 
     def load(self, pose: Pose) -> Load:
@@ -156,8 +157,11 @@ class AttitudeContact:
         return np.unique(np.concatenate(found), axis=0)
 
     def _placement(self, pose: Pose) -> tuple[Float, Float]:
-        to_reference = self._reference_from_attitude
-        return to_reference @ rotation_z(pose.theta), to_reference @ np.array([pose.x, pose.y, pose.z])
+        if self._turned[0] != pose.theta:  # most tests follow one another along delta
+            rotation = self._reference_from_attitude @ rotation_z(pose.theta)
+            rotation.flags.writeable = False
+            self._turned = pose.theta, rotation
+        return self._turned[1], self._reference_from_attitude @ np.array([pose.x, pose.y, pose.z])
 
 
 @lru_cache(maxsize=8)
