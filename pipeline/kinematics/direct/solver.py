@@ -143,6 +143,8 @@ class DirectAttitude:
         """Over the height map, then over the triangles; a second time over all of them where some were overlooked."""
         kernels, settings = self.solver.kernels, self.solver.settings
         best = self._run(kernels.search, start, settings.search)
+        if best.pose is None and best.steps == 0 and (met := self.depth(start)) is not None:
+            best = Climb(met, 0, ended=True)  # thinner than the nodes of the map lie apart
         if best.pose is None:
             return best
         found = self._run(kernels.polish, best.pose, settings.polish)

@@ -158,3 +158,17 @@ def test_a_body_that_slides_stops_where_a_post_hangs_down(post_mm: float) -> Non
     assert quick.pose.z >= slow.pose.z - 1e-3
     assert not contact.touches(quick.pose)
     assert contact.touches(quick.pose._replace(z=quick.pose.z + 5e-3))
+
+
+@pytest.mark.parametrize("across_mm", [0.05, 0.3, 1.0])
+def test_a_needle_thinner_than_the_map_comes_to_rest_in_the_middle_of_a_dish(across_mm: float) -> None:
+    """Nodes and samples lie at multiples of 0.6 mm at most, the needle between them."""
+    half = 0.5 * across_mm
+    needle = box((0.29 - half, 0.29 + half), (0.31 - half, 0.31 + half), (0.0, 20.0))
+    bowl_up = dish(6.0, sectors=32)
+    contact = AttitudeContact(FclBodies(needle, bowl_up), *LEVEL)
+    found = solver(needle, bowl_up).at(LEVEL).solve(Pose(1.0, -0.8, -30.0, 0.0))
+    assert found.status is Status.OK
+    assert not contact.touches(found.pose)
+    assert contact.touches(found.pose._replace(z=found.pose.z + 2e-3))
+    np.testing.assert_allclose(found.pose[:2], [0.29, 0.31], atol=0.05 + half)
