@@ -7,6 +7,8 @@ pose is the least of all features that are *there* (corner within the face, cros
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 
 from pipeline.kinematics.compilation import compiled, inlined
@@ -25,6 +27,7 @@ from pipeline.kinematics.direct.surfaces import (
 #: Edges whose cross product seen along z is below this (mm^2) do not cross.
 PARALLEL = 1e-12
 
+Table = TypeVar("Table", Float, Int)
 Cell = tuple[int, int]
 #: x0, y0 and size of the cells.
 Corner = tuple[float, float, float]
@@ -204,9 +207,10 @@ def _planes_meet(facing: Float, item: int, boxes: Float, n: int, ceiling: float)
 
 
 @compiled
-def _longer(pairs: Int, more: int) -> Int:
-    out = np.empty((2 * pairs.shape[0] + more, pairs.shape[1]), dtype=np.int32)
-    out[: pairs.shape[0]] = pairs
+def _longer(rows: Table, more: int) -> Table:
+    """The same rows with room for as many again and some more."""
+    out = np.empty((2 * rows.shape[0] + more, rows.shape[1]), dtype=rows.dtype)
+    out[: rows.shape[0]] = rows
     return out
 
 
@@ -229,7 +233,7 @@ def rows_of(attitude: Attitude, pairs: Int, pose: Float, ceiling: float) -> Rows
         _face(first, face)
         _face(second, other)
         if count + MOST_OF_A_PAIR > found.shape[0]:
-            found = _more_rows(found)
+            found = _longer(found, 0)
         for k in range(3):
             if own_below[m] >> k & 1 and _over(face, second, k, found, count):
                 found[count, 0] -= second[k, 2]
@@ -287,13 +291,6 @@ def _crossing(above: Side, below: Side, found: Float, row: int) -> bool:
     found[row, 1], found[row, 2] = (uz * vy - vz * uy) * per, (ux * vz - vx * uz) * per
     found[row, 3], found[row, 4] = first[a, 0] + on_u * ux, first[a, 1] + on_u * uy
     return bool(min(on_u, 1.0 - on_u, on_v, 1.0 - on_v) >= 0.0)
-
-
-@compiled
-def _more_rows(found: Float) -> Float:
-    out = np.empty((2 * found.shape[0], found.shape[1]))
-    out[: found.shape[0]] = found
-    return out
 
 
 @compiled

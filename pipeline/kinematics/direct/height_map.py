@@ -109,6 +109,23 @@ def rasterise(points: Float, triangles: Int, heights: HeightMap) -> None:
                     z[j, i] = min(z[j, i], az + v * uz + w * wz)
 
 
+@inlined
+def _height_above(z: Float, u: float, v: float) -> tuple[float, float, float]:
+    """Height between the nodes at (u, v), in units of the spacing from node (0, 0), and its slopes per unit.
+
+    ``NOTHING_MM`` outside the map and where a node beside it has nothing above.
+    """
+    if min(u, v, z.shape[1] - 1 - u, z.shape[0] - 1 - v) <= 0.0:
+        return NOTHING_MM, 0.0, 0.0
+    i, j = int(u), int(v)
+    z00, z01, z10, z11 = z[j, i], z[j, i + 1], z[j + 1, i], z[j + 1, i + 1]
+    if max(z00, z01, z10, z11) > FAR_MM:
+        return NOTHING_MM, 0.0, 0.0
+    u, v = u - i, v - j
+    height = (z00 * (1.0 - u) + z01 * u) * (1.0 - v) + (z10 * (1.0 - u) + z11 * u) * v
+    return height, (z01 - z00) * (1.0 - v) + (z11 - z10) * v, (z10 - z00) * (1.0 - u) + (z11 - z01) * u
+
+
 @compiled
 def gaps_at(heights: HeightMap, samples: Float, pose: Float, found: Rows) -> float:
     """Gap along z of each sample at a pose, and its change per mm of x, of y and per rad of theta.
@@ -127,7 +144,6 @@ def gaps_at(heights: HeightMap, samples: Float, pose: Float, found: Rows) -> flo
     float
         The least gap.
     """
-    ny, nx = heights.z.shape
     c, s, per = np.cos(pose[2]), np.sin(pose[2]), 1.0 / heights.spacing
     gaps, rates, z = found.gaps, found.rates, heights.z
     least = NOTHING_MM
@@ -135,17 +151,12 @@ def gaps_at(heights: HeightMap, samples: Float, pose: Float, found: Rows) -> flo
         rx = c * samples[k, 0] - s * samples[k, 1]
         ry = s * samples[k, 0] + c * samples[k, 1]
         u, v = (rx + pose[0] - heights.x0) * per, (ry + pose[1] - heights.y0) * per
+        height, along_u, along_v = _height_above(z, u, v)
         gaps[k] = NOTHING_MM
-        if min(u, v, nx - 1 - u, ny - 1 - v) <= 0.0:
+        if height > FAR_MM:
             continue
-        i, j = int(u), int(v)
-        z00, z01, z10, z11 = z[j, i], z[j, i + 1], z[j + 1, i], z[j + 1, i + 1]
-        if max(z00, z01, z10, z11) > FAR_MM:
-            continue
-        u, v = u - i, v - j
-        gaps[k] = (z00 * (1.0 - u) + z01 * u) * (1.0 - v) + (z10 * (1.0 - u) + z11 * u) * v - samples[k, 2]
-        rates[k, 0] = ((z01 - z00) * (1.0 - v) + (z11 - z10) * v) * per
-        rates[k, 1] = ((z10 - z00) * (1.0 - u) + (z11 - z01) * u) * per
+        gaps[k] = height - samples[k, 2]
+        rates[k, 0], rates[k, 1] = along_u * per, along_v * per
         rates[k, 2] = rates[k, 1] * rx - rates[k, 0] * ry
         least = min(least, gaps[k])
     return least
@@ -154,21 +165,13 @@ def gaps_at(heights: HeightMap, samples: Float, pose: Float, found: Rows) -> flo
 @compiled
 def depth_over(heights: HeightMap, samples: Float, pose: Float, gaps: Float) -> float:
     """Write the gap of every sample as :func:`gaps_at` does, without its change; the least."""
-    ny, nx = heights.z.shape
     c, s, per, z = np.cos(pose[2]), np.sin(pose[2]), 1.0 / heights.spacing, heights.z
     least = NOTHING_MM
     for k in range(samples.shape[0]):
         rx = c * samples[k, 0] - s * samples[k, 1]
         ry = s * samples[k, 0] + c * samples[k, 1]
         u, v = (rx + pose[0] - heights.x0) * per, (ry + pose[1] - heights.y0) * per
-        gaps[k] = NOTHING_MM
-        if min(u, v, nx - 1 - u, ny - 1 - v) <= 0.0:
-            continue
-        i, j = int(u), int(v)
-        z00, z01, z10, z11 = z[j, i], z[j, i + 1], z[j + 1, i], z[j + 1, i + 1]
-        if max(z00, z01, z10, z11) > FAR_MM:
-            continue
-        u, v = u - i, v - j
-        gaps[k] = (z00 * (1.0 - u) + z01 * u) * (1.0 - v) + (z10 * (1.0 - u) + z11 * u) * v - samples[k, 2]
+        height, _, _ = _height_above(z, u, v)
+        gaps[k] = height - samples[k, 2] if height <= FAR_MM else NOTHING_MM
         least = min(least, gaps[k])
     return least

@@ -166,11 +166,9 @@ class DirectAttitude:
         """Exact depth at a pose, more than ``FAR_MM`` where nothing is met."""
         depth_at, near = self.solver.kernels.depth_at, self._surfaces_at(pose)
         z = depth_at(near, _array(pose))
-        return (
-            z
-            if z + self._highest <= near.ceiling_mm
-            else depth_at(self._surfaces_at(pose._replace(z=np.inf)), _array(pose))
-        )
+        if z + self._highest > near.ceiling_mm:  # what was left out may be met first
+            z = depth_at(self._surfaces_at(pose._replace(z=np.inf)), _array(pose))
+        return z
 
     def _enclosed(self, pose: Pose) -> bool:
         bodies, to_reference = self.solver.bodies, attitude_rotation(*self._angles_rad)
