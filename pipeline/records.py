@@ -203,8 +203,9 @@ class CrossCheck:
 
     Attributes
     ----------
-    cells, agreeing, shallower : int
-        Compared; equal within the other's resolutions; where the table's pose is less deep.
+    cells, unsolved, agreeing, shallower : int
+        Compared; asked for in vain, since the other solver found no pose; equal within the other's resolutions; where
+        the table's pose is less deep.
     shift_mm, rotation_deg : float
         Largest differences.
     deeper_mm, shallower_mm : float
@@ -212,6 +213,7 @@ class CrossCheck:
     """
 
     cells: int
+    unsolved: int
     agreeing: int
     shallower: int
     shift_mm: float

@@ -33,11 +33,14 @@ class Differences(NamedTuple):
         Difference of (x, y) and of rotation.
     deeper_mm : (K,) float64
         How much farther along delta the table's solver came.
+    unsolved : int
+        Cells in which the other solver found no stable pose.
     """
 
     shift_mm: np.ndarray[tuple[int], np.dtype[np.float64]]
     rotation_deg: np.ndarray[tuple[int], np.dtype[np.float64]]
     deeper_mm: np.ndarray[tuple[int], np.dtype[np.float64]]
+    unsolved: int
 
 
 def rechecks(grid: Grid, found: Mapping[Place, Found], fraction: float, centre: Pose) -> list[Recheck]:
@@ -61,7 +64,9 @@ def differences(found: Mapping[Place, Found], asked: Sequence[Recheck], answers:
         if other.status.usable
     ]
     away = np.array(rows).reshape(-1, 4)
-    return Differences(np.hypot(away[:, 0], away[:, 1]), np.degrees(np.abs(away[:, 3])), away[:, 2])
+    return Differences(
+        np.hypot(away[:, 0], away[:, 1]), np.degrees(np.abs(away[:, 3])), away[:, 2], len(asked) - len(rows)
+    )
 
 
 def agreeing(different: Differences, shift_mm: float, rotation_deg: float) -> int:

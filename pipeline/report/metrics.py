@@ -169,7 +169,10 @@ def _jump_metrics(facts: SweepFacts) -> Iterator[Metric]:
 def _cross_check_metrics(check: CrossCheck) -> Iterator[Metric]:
     if not check.cells:
         return
-    meaning = f"Share of {check.cells} attitudes where the other solver, from the same start, finds the same pose."
+    meaning = (
+        f"Share of {check.cells} attitudes where the other solver, from the same start, finds the same pose; "
+        f"in {check.unsolved} more it finds none."
+    )
     share = 100.0 * check.agreeing / check.cells
     yield info(Measured("cross_check_agreeing", "Solvers agree", share, "%", meaning))
     meaning = "Largest difference of the two solvers; where a maximum is not unique they may choose differently."

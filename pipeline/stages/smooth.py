@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from pydantic import Field
@@ -15,6 +16,7 @@ from pipeline.errors import CaseRejected
 from pipeline.kinematics.cell import Cell, Claim, Proof, failed_cell
 from pipeline.kinematics.contact import Pose
 from pipeline.kinematics.interpolation import found_at, pose_curves, usable_entries
+from pipeline.kinematics.midpoints import shared_error
 from pipeline.kinematics.smoothing import Entry, Probe, Settled, ends, entries, fit_curves
 from pipeline.kinematics.sweep import angles_rad, pose_table
 from pipeline.kinematics.table import Float, Grid, PoseTable, RawTable, SmoothTable, Status
@@ -23,10 +25,19 @@ from pipeline.kinematics.table import Float, Grid, PoseTable, RawTable, SmoothTa
 class Params(ContactParams):
     """Degrees of the polynomials and how the result is proven."""
 
+    contact_band_mm: float = Field(
+        0.145, gt=0, le=1, description="features closer than this hold an entry (one arc minute at 0.5 m)"
+    )
     degree_flexion: int = Field(6, ge=0, le=20, description="degree in flexion (the paper's 6)")
     degree_varus: int = Field(3, ge=0, le=6, description="degree in varus, lowered until midpoints hold their limit")
     midpoint_limit_mm: float = Field(
         0.145, gt=0, le=10, description="gap or overlap allowed half-way between entries (one arc minute at 0.5 m)"
+    )
+    midpoint_aim_mm: float = Field(
+        0.04, gt=0, le=10, description="where a midpoint is farther from contact, entries share the error"
+    )
+    entry_allowance_mm: float = Field(
+        0.015, ge=0, le=1, description="how far an entry may then stand off contact; 0 keeps every entry in contact"
     )
     fill_gap_deg: float = Field(
         25.0, ge=0, le=180, description="failed cells between usable ones at most this far apart are smoothed over"
@@ -62,16 +73,29 @@ def _smoothed(raw: RawTable, degree_varus: int, params: Params, joint: Joint) ->
             "E-SMO-01", f"The curves cannot be smoothed: {error}.", "Narrow the range of angles or lower the degree."
         ) from error
     cells = _in_rows(_cells(joint, entries(raw, fits, params.fill_gap_deg)), raw.grid)
-    poses = pose_table(cells)
+    poses, contact_error = pose_table(cells), np.array([[_contact_error(cell.proof) for cell in row] for row in cells])
+    midpoint_error = _midpoint_errors(raw.grid, poses, joint)
+    push = shared_error(
+        raw.grid, usable_entries(poses), midpoint_error, params.midpoint_aim_mm, params.entry_allowance_mm
+    )
+    if push.any():
+        poses = replace(poses, proximal_mm=poses.proximal_mm + push)
+        contact_error = np.where(push == 0.0, contact_error, _outermost(contact_error, -push))
+        midpoint_error = _midpoint_errors(raw.grid, poses, joint)
     return SmoothTable(
         grid=raw.grid,
         poses=poses,
         fits=fits,
         flexion_range_deg=ends(raw.grid.flexion_deg),
         varus_range_deg=ends(raw.grid.varus_deg),
-        contact_error_mm=np.array([[_contact_error(cell.proof) for cell in row] for row in cells]),
-        midpoint_error_mm=_midpoint_errors(raw.grid, poses, joint),
+        contact_error_mm=contact_error,
+        midpoint_error_mm=midpoint_error,
     )
+
+
+def _outermost(bound_mm: Float, shift_mm: Float) -> Float:
+    """Bound of the signed way to contact of entries moved by ``shift_mm`` from poses proven within ``bound_mm``."""
+    return np.asarray(shift_mm + np.copysign(bound_mm, shift_mm))
 
 
 def _cells(joint: Joint, wanted: Sequence[Entry]) -> list[Cell]:

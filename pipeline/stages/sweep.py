@@ -237,6 +237,7 @@ def _facts(params: Params, jumped: tuple[Jumps, Jumps], different: Differences) 
         jumps_after=after,
         cross_check=CrossCheck(
             cells=len(different.shift_mm),
+            unsolved=different.unsolved,
             agreeing=agreeing(different, params.translation_resolution_mm, params.rotation_resolution_deg),
             shallower=shallower(different),
             shift_mm=float(different.shift_mm.max(initial=0.0)),
@@ -275,7 +276,8 @@ def _findings(table: RawTable, facts: SweepFacts) -> Findings:
         message = (
             f"{check.cells} attitudes solved by the other solver too: {check.agreeing} agree within its resolutions; "
             f"largest difference {check.shift_mm:.2f} mm, {check.rotation_deg:.2f} deg. "
-            f"The table's pose is shallower in {check.shallower} (at most {check.shallower_mm:.3f} mm)."
+            f"The table's pose is shallower in {check.shallower} (at most {check.shallower_mm:.3f} mm). "
+            f"In {check.unsolved} more the other solver found no pose."
         )
         found.append(Finding("N-SWP-03", Severity.NOTE, message))
     return tuple(found)

@@ -25,7 +25,7 @@ from pipeline.playback import Lut
 from tests.bench import Figure, seconds, sweeps
 from tests.bench.knees import cases
 from tests.bench.memory import PeakMemory
-from tests.end_to_end.knee_runs import Silent
+from tests.end_to_end.knee_runs import Silent, left
 
 REPORT = Path("build/bench.json")
 
@@ -57,9 +57,9 @@ def patient_figures(first: RunOutcome, cached_s: float) -> Iterator[Figure]:
 
 def contact_figures(results: Path) -> Iterator[Figure]:
     """Queries of the exact collision test, and a drop."""
-    anatomy = ANATOMY.decode({"": (results / "40_anatomy" / ANATOMY.file).read_bytes()})
-    reference = REFERENCE_BODY.decode({"": (results / "50_contact" / REFERENCE_BODY.file).read_bytes()})
-    moving = MOVING_BODY.decode({"": (results / "50_contact" / MOVING_BODY.file).read_bytes()})
+    anatomy = left(results, ANATOMY)
+    reference = left(results, REFERENCE_BODY)
+    moving = left(results, MOVING_BODY)
     params = ContactParams()
     bodies = params.pair(reference, moving, anatomy).bodies()
     contact = AttitudeContact(bodies, np.radians(anatomy.scan_attitude[0]), np.radians(anatomy.scan_attitude[1]))

@@ -16,7 +16,7 @@ from pipeline.files.phantom_case import write_phantom_case
 from pipeline.flow import FLOW
 from pipeline.geometry.phantom_spec import PhantomSpec
 from pipeline.records import Anatomy
-from tests.end_to_end.knee_runs import Silent
+from tests.end_to_end.knee_runs import Silent, left
 
 REAL_KNEE = Path(__file__).resolve().parents[3] / "shared" / "data" / "knee_mr_a"
 
@@ -43,7 +43,7 @@ def knee(name: str, case: Path, folder: Path, triangles: int) -> Knee:
     settings = load_settings(FLOW, case, "clinical", (f"contact.triangles={triangles}",))
     job = CaseJob(name, case, folder / "bodies" / name)
     run_case(job, FLOW[:4], settings, Execution(jobs=2), Silent())
-    anatomy = ANATOMY.decode({"": (job.results / "40_anatomy" / ANATOMY.file).read_bytes()})
-    reference = REFERENCE_BODY.decode({"": (job.results / "50_contact" / REFERENCE_BODY.file).read_bytes()})
-    moving = MOVING_BODY.decode({"": (job.results / "50_contact" / MOVING_BODY.file).read_bytes()})
+    anatomy = left(job.results, ANATOMY)
+    reference = left(job.results, REFERENCE_BODY)
+    moving = left(job.results, MOVING_BODY)
     return Knee(name, ContactParams().pair(reference, moving, anatomy), anatomy)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.artifacts import NEUTRAL_CURVE, RAW_TABLE, SMOOTH_TABLE
 from pipeline.config import load_settings
+from pipeline.engine.artifacts import Artifact
 from pipeline.engine.outcome import Execution, RunOutcome
 from pipeline.engine.runner import CaseJob, run_case
 from pipeline.engine.stage import Stage
@@ -21,6 +23,8 @@ from pipeline.geometry.phantom_spec import PhantomSpec
 from pipeline.geometry.volume import LabelVolume
 from pipeline.kinematics.neutral import NeutralCurve
 from pipeline.kinematics.table import PoseTable
+
+T = TypeVar("T")
 
 #: Up to the smoothed table: the numbers, without pictures and package.
 NUMBERS = FLOW[:6]
@@ -90,16 +94,20 @@ def files_of(folder: Path) -> dict[str, bytes]:
     }
 
 
+def left(results: Path, artifact: Artifact[T]) -> T:
+    """What a case's results hold of one artifact of one file."""
+    (path,) = results.glob(f"[0-9]*_*/{artifact.file}")
+    return artifact.decode({"": path.read_bytes()})
+
+
 def poses(results: Path) -> tuple[PoseTable, PoseTable]:
     """Raw and smoothed poses of a case's results."""
-    raw = RAW_TABLE.decode({"": (results / "60_sweep" / RAW_TABLE.file).read_bytes()})
-    smooth = SMOOTH_TABLE.decode({"": (results / "70_smooth" / SMOOTH_TABLE.file).read_bytes()})
-    return raw.poses, smooth.poses
+    return left(results, RAW_TABLE).poses, left(results, SMOOTH_TABLE).poses
 
 
 def neutral(results: Path) -> NeutralCurve:
     """The neutral curve of a case's results."""
-    return NEUTRAL_CURVE.decode({"": (results / "60_sweep" / NEUTRAL_CURVE.file).read_bytes()})
+    return left(results, NEUTRAL_CURVE)
 
 
 def largest_difference(first: PoseTable, second: PoseTable) -> tuple[float, float]:

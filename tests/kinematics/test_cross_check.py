@@ -45,6 +45,7 @@ def test_differences_and_what_they_count_as() -> None:
     np.testing.assert_allclose(found.deeper_mm, [0.0, -0.02, 0.5])
     assert agreeing(found, 0.1, 0.1) == 1
     assert shallower(found) == 1
+    assert found.unsolved == 1
 
 
 def test_the_other_solver_finds_the_pose_of_a_known_joint() -> None:

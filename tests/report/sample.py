@@ -44,7 +44,14 @@ SWEEP = SweepFacts(
     jumps_before=JumpCount(5, 1.9, 4.0),
     jumps_after=JumpCount(2, 1.2, 3.5),
     cross_check=CrossCheck(
-        cells=20, agreeing=19, shallower=1, shift_mm=0.3, rotation_deg=0.7, deeper_mm=0.05, shallower_mm=0.02
+        cells=20,
+        unsolved=0,
+        agreeing=19,
+        shallower=1,
+        shift_mm=0.3,
+        rotation_deg=0.7,
+        deeper_mm=0.05,
+        shallower_mm=0.02,
     ),
 )
 STAGES = ("intake", "mesh", "anatomy", "contact", "sweep", "smooth")

@@ -158,17 +158,18 @@ def test_margins_are_medians_where_the_solver_knows_them() -> None:
 
 
 def test_the_cross_check_says_how_many_agree_and_how_far_apart_the_others_are() -> None:
-    check = CrossCheck(40, 36, 3, shift_mm=1.1, rotation_deg=2.2, deeper_mm=0.5, shallower_mm=0.06)
+    check = CrossCheck(40, 2, 36, 3, shift_mm=1.1, rotation_deg=2.2, deeper_mm=0.5, shallower_mm=0.06)
     metrics = measured(with_sweep(cross_check=check))
     assert metrics["cross_check_agreeing"].value == pytest.approx(90.0)
     assert "40 attitudes" in metrics["cross_check_agreeing"].meaning
+    assert "in 2 more it finds none" in metrics["cross_check_agreeing"].meaning
     assert (metrics["cross_check_mm"].value, metrics["cross_check_deg"].value) == (1.1, 2.2)
     assert metrics["cross_check_shallower"].value == 0.06
     assert "3 attitudes" in metrics["cross_check_shallower"].meaning
 
 
 def test_without_a_cross_check_nothing_is_said_of_it() -> None:
-    metrics = measured(with_sweep(cross_check=CrossCheck(0, 0, 0, 0.0, 0.0, 0.0, 0.0)))
+    metrics = measured(with_sweep(cross_check=CrossCheck(0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0)))
     assert not [name for name in metrics if name.startswith("cross_check")]
 
 

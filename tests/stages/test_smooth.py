@@ -98,6 +98,19 @@ def test_midpoints_are_measured_where_both_ends_are_shown(made: tuple[Run, Findi
     assert np.ptp(measured) > 1e-5
 
 
+def test_entries_share_the_error_of_midpoints_and_say_so(made: tuple[Run, Findings]) -> None:
+    exact = made[0][SMOOTH_TABLE]
+    worst = float(np.nanmax(np.abs(exact.midpoint_error_mm)))
+    params = PARAMS.model_copy(update={"midpoint_aim_mm": 0.7 * worst, "entry_allowance_mm": 0.8 * worst})
+    shared = smoothed(raw_table(GRID, [(3, 1), (0, 0)], offset_mm=0.05), params)[0][SMOOTH_TABLE]
+    assert np.nanmax(np.abs(shared.midpoint_error_mm)) <= 0.7 * worst + 1e-6
+    push = shared.poses.proximal_mm - exact.poses.proximal_mm
+    shown = np.isfinite(push)
+    assert 0.1 * worst < np.abs(push[shown]).max() <= 0.8 * worst + 1e-12
+    # what is told of an entry bounds where it stands: beyond its push by no more than the proof of contact
+    assert np.all(np.abs(shared.contact_error_mm[shown] + push[shown]) <= np.abs(exact.contact_error_mm[shown]) + 1e-12)
+
+
 def test_a_failed_cell_between_usable_ones_is_shown_and_said(made: tuple[Run, Findings]) -> None:
     run, findings = made
     status = run[SMOOTH_TABLE].poses.status

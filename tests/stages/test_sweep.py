@@ -146,7 +146,7 @@ def test_a_full_table_without_jumps_is_only_noted(swept: tuple[Run, Findings]) -
     facts = run[SWEEP_FACTS]
     assert facts.jumps_before.count == facts.jumps_after.count == 0
     assert 0.0 < facts.jumps_after.largest_mm < 2.0 * PLACE_MM
-    assert facts.cross_check == CrossCheck(0, 0, 0, 0.0, 0.0, 0.0, 0.0)
+    assert facts.cross_check == CrossCheck(0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0)
 
 
 def test_the_solvers_are_compared_where_that_is_asked_for(checked: tuple[Run, Findings]) -> None:

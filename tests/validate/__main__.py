@@ -11,10 +11,11 @@ from tests.validate import Measurement, Row
 from tests.validate.knees import ROWS as KNEES
 from tests.validate.measured_motion import ROWS as MOTION
 from tests.validate.mesh_and_mirror import ROWS as MESH_AND_MIRROR
+from tests.validate.neutral_motion import ROWS as NEUTRAL
 from tests.validate.paper_objects import ROWS as PAPER_OBJECTS
 
 REPORT = Path("build/validate.json")
-ROWS: tuple[Measurement, ...] = (*PAPER_OBJECTS, *KNEES, *MESH_AND_MIRROR, *MOTION)
+ROWS: tuple[Measurement, ...] = (*PAPER_OBJECTS, *KNEES, *MESH_AND_MIRROR, *MOTION, *NEUTRAL)
 
 
 def line(row: Row) -> str:

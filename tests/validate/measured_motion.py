@@ -46,16 +46,26 @@ class Variant(NamedTuple):
     smoothed: bool
 
 
-def _body(names: tuple[str, ...]) -> TriangleMesh:
-    meshes = [read_mesh((KNEE / f"{name}.ply").read_bytes(), f"{name}.ply").mesh for name in names]
-    return transformed(merged(meshes), OURS_FROM_DATA)
+def given_mesh(name: str) -> TriangleMesh:
+    """A mesh of the folder as it is given, in the axes of the data."""
+    return read_mesh((KNEE / f"{name}.ply").read_bytes(), f"{name}.ply").mesh
+
+
+def frame_matrices() -> Float:
+    """(N, 4, 4) ``femur_from_tibia`` of each frame, mm, in the axes of the data."""
+    rows = np.genfromtxt(KNEE / "passive_motion.csv", delimiter=",", skip_header=1)
+    return np.asarray(rows[:, 1:].reshape(-1, 4, 4))
+
+
+def body_of(names: tuple[str, ...]) -> TriangleMesh:
+    """Several meshes as one body, in our axes."""
+    return transformed(merged([given_mesh(name) for name in names]), OURS_FROM_DATA)
 
 
 @cache
 def measured_frames() -> Float:
     """(N, 6) flexion, varus, internal rotation (rad), lateral, anterior, proximal (mm) of each frame."""
-    rows = np.genfromtxt(KNEE / "passive_motion.csv", delimiter=",", skip_header=1)[:, 1:].reshape(-1, 4, 4)
-    return np.array([joint_coordinates(OURS_FROM_DATA @ frame @ OURS_FROM_DATA.T) for frame in rows])
+    return np.array([joint_coordinates(OURS_FROM_DATA @ frame @ OURS_FROM_DATA.T) for frame in frame_matrices()])
 
 
 def smoothed_frames() -> Float:
@@ -78,21 +88,22 @@ def fibres() -> Fibres:
 def differences(variant: Variant) -> Float:
     """(N, 4) solved minus measured: rotation (deg), lateral, anterior, proximal (mm); NaN where no pose was found."""
     frames = smoothed_frames() if variant.smoothed else measured_frames()
-    bodies = prepare(_body(REFERENCE), _body(MOVING))
+    bodies = prepare(body_of(REFERENCE), body_of(MOVING))
     solver = DirectSolver(bodies, fibres=fibres() if variant.ligaments else NO_FIBRES)
-    start, rows = _pose(frames[0]), []
+    start, rows = pose_of(frames[0]), []
     for frame in frames:
-        found = solver.at((float(frame[0]), float(frame[1]))).solve(start, _pose(frame))
+        found = solver.at((float(frame[0]), float(frame[1]))).solve(start, pose_of(frame))
         if found.status.usable:
             start = found.pose
-            x, y, z, turn = np.subtract(found.pose, _pose(frame))
+            x, y, z, turn = np.subtract(found.pose, pose_of(frame))
             rows.append([np.degrees(turn), x, y, z])
         else:
             rows.append([np.nan] * 4)
     return np.array(rows)
 
 
-def _pose(frame: Float) -> Pose:
+def pose_of(frame: Float) -> Pose:
+    """The found coordinates of a frame."""
     _, _, turn, x, y, z = (float(value) for value in frame)
     return Pose(x, y, z, turn)
 

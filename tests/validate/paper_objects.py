@@ -18,7 +18,7 @@ from pipeline.kinematics.direct.solver import DirectSolver
 from pipeline.kinematics.incremental import IncrementalSettings, solve_incremental
 from pipeline.kinematics.table import Status
 from tests.kinematics.settings import BALL_STARTS, BAR_STARTS, FINE, FINE_BAR, LARGE_MM, with_steps
-from tests.kinematics.shapes import falling
+from tests.kinematics.shapes import HelicalGroove, at_attitude, falling
 from tests.validate import Row
 
 Float = NDArray[np.float64]
@@ -91,4 +91,39 @@ def bar_equilibrium() -> Row:
     return Row("bar_residual", "bar on pyramids: equilibrium residual", float(_bar()[:, 4].max()), "", 0.01)
 
 
-ROWS = (ball_off_centre, ball_height, ball_equilibrium, bar_sideways, bar_height, bar_turn, bar_equilibrium)
+@cache
+def _runner() -> Float:
+    """(N, 4) found minus closed form of the runner in the helical groove, by both solvers; NaN without a pose."""
+    groove, rows = HelicalGroove(), []
+    bodies = groove.reference_body(), groove.moving_body()
+    direct = DirectSolver(prepare(*bodies))
+    for flexion in np.radians([-35.0, -10.0, 0.0, 10.0, 30.0]):
+        angles, wanted = (float(flexion), 0.0), groove.rest(float(flexion))
+        start = Pose(wanted.x + 0.6, 1.0, wanted.z - 8.0, wanted.theta + 0.05)
+        for found in (direct.at(angles).solve(start), solve_incremental(at_attitude(*bodies, *angles), start, FINE)):
+            rows.append(np.subtract(found.pose, wanted) if found.status is Status.OK else np.full(4, np.nan))
+    return np.array(rows)
+
+
+def groove_place() -> Row:
+    """Place of the runner, which the groove dictates at each flexion."""
+    return Row("groove_mm", "runner in helical groove: place", float(np.abs(_runner()[:, :3]).max()), "mm", 0.02)
+
+
+def groove_turn() -> Row:
+    """Rotation of the runner, which the groove dictates at each flexion."""
+    turn = float(np.degrees(np.abs(_runner()[:, 3]).max()))
+    return Row("groove_deg", "runner in helical groove: rotation", turn, "deg", 0.05)
+
+
+ROWS = (
+    ball_off_centre,
+    ball_height,
+    ball_equilibrium,
+    bar_sideways,
+    bar_height,
+    bar_turn,
+    bar_equilibrium,
+    groove_place,
+    groove_turn,
+)

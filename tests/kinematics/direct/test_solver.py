@@ -21,7 +21,7 @@ from pipeline.kinematics.incremental import StablePose, solve_incremental
 from pipeline.kinematics.joint_coordinates import rotation_x
 from pipeline.kinematics.table import Status
 from tests.kinematics.settings import BALL_STARTS, BAR_STARTS, PAPER
-from tests.kinematics.shapes import ellipsoid, groove, joined, shifted, turned_down
+from tests.kinematics.shapes import HelicalGroove, ellipsoid, groove, joined, shifted, turned_down
 
 LEVEL = (0.0, 0.0)
 
@@ -43,6 +43,11 @@ def bowl() -> DirectSolver:
 def pyramids() -> DirectSolver:
     pair = BarOnPyramids().pair()
     return solver(pair.reference_body, pair.moving_body)
+
+
+@pytest.fixture(scope="module")
+def runner() -> DirectSolver:
+    return solver(HelicalGroove().reference_body(), HelicalGroove().moving_body())
 
 
 @pytest.mark.parametrize("start", BALL_STARTS)
@@ -90,6 +95,17 @@ def test_turned_reference_gives_the_turned_answer(flexion: float) -> None:
     found = solver(tilted, pair.moving_body).at((flexion, 0.0)).solve(BALL_STARTS[-1])
     assert found.status is Status.OK
     np.testing.assert_allclose(found.pose[:3], [0.0, 0.0, -6.0], atol=0.02)
+
+
+@pytest.mark.parametrize("flexion_deg", [-35.0, 0.0, 10.0, 30.0])
+def test_a_helical_groove_dictates_place_and_rotation(runner: DirectSolver, flexion_deg: float) -> None:
+    flexion = float(np.radians(flexion_deg))
+    wanted = HelicalGroove().rest(flexion)
+    start = Pose(wanted.x + 0.6, 1.0, wanted.z - 8.0, wanted.theta + 0.05)
+    found = runner.at((flexion, 0.0)).solve(start)
+    assert found.status is Status.OK
+    np.testing.assert_allclose(found.pose[:3], wanted[:3], atol=0.02)
+    assert np.degrees(found.pose.theta) == pytest.approx(np.degrees(wanted.theta), abs=0.05)
 
 
 @each_kernel
