@@ -1,10 +1,10 @@
-"""Label volumes: an array of voxels and where it lies in the patient."""
+"""Volumes: an array of voxels, labels or CT numbers, and where it lies in the patient."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,30 @@ class LabelVolume:
         return np.asarray(np.linalg.norm(self.lps_from_index[:3, :3], axis=0))
 
 
+@dataclass(frozen=True, eq=False)
+class CtVolume:
+    """A CT.
+
+    Attributes
+    ----------
+    values : (I, J, K) int16
+        CT number of each voxel, Hounsfield units.
+    lps_from_index : (4, 4) float64
+        As in :class:`LabelVolume`.
+    """
+
+    values: NDArray[np.int16]
+    lps_from_index: NDArray[np.float64]
+
+    @property
+    def spacing_mm(self) -> NDArray[np.float64]:
+        """(3,) voxel size along i, j, k."""
+        return np.asarray(np.linalg.norm(self.lps_from_index[:3, :3], axis=0))
+
+
+AnyVolume = TypeVar("AnyVolume", LabelVolume, CtVolume)
+
+
 class Pieces(NamedTuple):
     """The 26-connected pieces of a mask: their numbers (0 is background) and their sizes in voxels, largest first."""
 
@@ -68,19 +92,19 @@ def shear(lps_from_index: Float) -> float:
     return float(np.abs(axes.T @ axes - np.eye(3)).max())
 
 
-def in_lps_order(volume: LabelVolume) -> LabelVolume:
+def in_lps_order(volume: AnyVolume) -> AnyVolume:
     """The same voxels stored in the order that is nearest to +L, +P, +S and right-handed.
 
     Every file that holds the same anatomy on the same grid, however its axes were stored, gives the same volume.
 
     Parameters
     ----------
-    volume : LabelVolume
+    volume : LabelVolume or CtVolume
         Index axes in any order and direction, also left-handed.
 
     Returns
     -------
-    LabelVolume
+    LabelVolume or CtVolume
         No voxel is resampled: axes are exchanged and reversed, data and matrix together.
     """
     order = _nearest_order(volume.lps_from_index)
@@ -96,7 +120,7 @@ def in_lps_order(volume: LabelVolume) -> LabelVolume:
         matrix[:3, axis] *= -1.0
         values = np.flip(values, int(axis))
     # + 0.0 turns -0.0 into 0.0, so that equal geometry is equal bytes
-    return LabelVolume(np.ascontiguousarray(values), matrix + 0.0)
+    return replace(volume, values=np.ascontiguousarray(values), lps_from_index=matrix + 0.0)
 
 
 def _nearest_order(lps_from_index: Float) -> tuple[int, ...]:
