@@ -34,6 +34,7 @@ ANATOMY = record_artifact("anatomy", "anatomy.json", Anatomy)
 # 50_contact
 REFERENCE_BODY = mesh_artifact("reference_body", "reference_body.npz")
 MOVING_BODY = mesh_artifact("moving_body", "moving_body.npz")
+MADE_MESHES = mesh_set_artifact("made_meshes", "made_meshes.npz")  # empty where nothing had to be made
 SURFACE_ORIGINS = record_artifact("surface_origins", "surface_origins.json", tuple[SurfaceOrigin, ...])
 
 # 60_sweep

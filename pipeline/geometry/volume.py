@@ -107,7 +107,7 @@ def in_lps_order(volume: AnyVolume) -> AnyVolume:
     LabelVolume or CtVolume
         No voxel is resampled: axes are exchanged and reversed, data and matrix together.
     """
-    order = _nearest_order(volume.lps_from_index)
+    order: tuple[int, ...] = _nearest_order(volume.lps_from_index)
     values = np.transpose(volume.values, order)
     matrix = volume.lps_from_index[:, (*order, 3)].copy()
     flips = matrix[[0, 1, 2], [0, 1, 2]] < 0

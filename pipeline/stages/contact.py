@@ -1,20 +1,92 @@
-"""Stage 50: the two rigid bodies that meet: what was labelled, as one closed surface each, in scan space."""
+"""Stage 50, contact: the two rigid bodies that meet: what was labelled, and what was made in place of what was not."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
 from pipeline.adapters.mask_surface import SurfaceResult, SurfaceSettings, SurfaceTask, meshes_of
-from pipeline.artifacts import ANATOMY, CASE_FACTS, LABELS, MESHES, MOVING_BODY, REFERENCE_BODY, SURFACE_ORIGINS
+from pipeline.artifacts import (
+    ANATOMY,
+    CASE_FACTS,
+    LABELS,
+    MADE_MESHES,
+    MESHES,
+    MOVING_BODY,
+    REFERENCE_BODY,
+    SURFACE_ORIGINS,
+)
 from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage, StrictParams
 from pipeline.errors import CaseRejected
+from pipeline.geometry.made_surfaces import MeniscusShape, SurfaceBounds
 from pipeline.geometry.mesh import TriangleMesh, merged
 from pipeline.geometry.volume import LabelVolume
 from pipeline.geometry.voxel_mask import part_with, seen_as_right, voxels_of
+from pipeline.missing_surfaces import NOTHING_MADE, Made, Missing, Request, filled_in, make_surfaces
 from pipeline.records import Anatomy, CaseFacts, SurfaceOrigin
+
+
+class MeniscusParams(StrictParams):
+    """Bounds of one made meniscus."""
+
+    height_mm: float = Field(gt=0, le=20, description="over the bone of the plateau, at most")
+    anterior_width_mm: float = Field(gt=0, le=30, description="of the anterior horn, from the outer edge inwards")
+    posterior_width_mm: float = Field(gt=0, le=30, description="of the posterior horn")
+    anterior_inset_mm: float = Field(ge=0, le=20, description="from the edge of the plateau in front")
+    posterior_inset_mm: float = Field(ge=0, le=20, description="from the edge of the plateau behind")
+
+    def shape(self) -> MeniscusShape:
+        """As the maths takes it."""
+        return MeniscusShape(**self.model_dump())
+
+
+class MadeParams(StrictParams):
+    """Bounds of cartilage and menisci that are made from the bones."""
+
+    least_cartilage_mm: float = Field(0.8, gt=0, le=10, description="thickness of one side, at least")
+    most_cartilage_mm: float = Field(3.0, gt=0, le=10, description="thickness of the femoral side, at most")
+    cartilage_mm: float = Field(2.0, gt=0, le=10, description="thickness where the bones of the scan do not tell")
+    thicker_mm: float = Field(
+        1.0, ge=0, le=10, description="tibial cartilage beyond its thickness where the bones are nearest"
+    )
+    clearance_mm: float = Field(0.15, ge=0, le=2, description="left between made surfaces at the scan pose")
+    filler_mm: float = Field(8.0, gt=0, le=30, description="height of the filler, at most")
+    triangle_mm2: float = Field(0.7, ge=0.05, le=10, description="area of a triangle of what is made, on average")
+    medial_meniscus: MeniscusParams = Field(
+        default=MeniscusParams(
+            height_mm=6.5,
+            anterior_width_mm=8.0,
+            posterior_width_mm=11.0,
+            anterior_inset_mm=1.0,
+            posterior_inset_mm=3.0,
+        ),
+        description="bounds of the medial meniscus",
+    )
+    lateral_meniscus: MeniscusParams = Field(
+        default=MeniscusParams(
+            height_mm=7.5,
+            anterior_width_mm=9.0,
+            posterior_width_mm=10.0,
+            anterior_inset_mm=3.0,
+            posterior_inset_mm=2.0,
+        ),
+        description="bounds of the lateral meniscus",
+    )
+
+    def bounds(self) -> SurfaceBounds:
+        """As the maths takes them."""
+        return SurfaceBounds(
+            thickness_mm=(self.least_cartilage_mm, self.most_cartilage_mm),
+            default_thickness_mm=self.cartilage_mm,
+            extra_mm=self.thicker_mm,
+            clearance_mm=self.clearance_mm,
+            medial=self.medial_meniscus.shape(),
+            lateral=self.lateral_meniscus.shape(),
+            filler_mm=self.filler_mm,
+        )
 
 
 class Params(StrictParams):
@@ -23,6 +95,12 @@ class Params(StrictParams):
     reference: list[str] = Field(min_length=1, description="structures of the body that stands still")
     moving: list[str] = Field(min_length=1, description="structures of the body that moves, rigid on one another")
     triangles: int = Field(60_000, ge=500, le=400_000, description="triangles of each body")
+    missing_surfaces: Missing = Field(
+        "leave",
+        description="cartilage and menisci that are not labelled: make them from the bones, put one filler between the "
+        "bones, or leave them out",
+    )
+    made: MadeParams = Field(default=MadeParams(), description="bounds of what is made")
     reach_mm: float = Field(
         90.0, gt=10, le=1000, description="what lies farther than this from the joint never meets and is left out"
     )
@@ -30,17 +108,50 @@ class Params(StrictParams):
 
 def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     """Make both contact bodies."""
-    facts = reads[CASE_FACTS]
-    present = [name for name in (*params.reference, *params.moving) if name in facts.structures]
-    if facts.source == "meshes":
-        meshes = reads[MESHES]
-        out[REFERENCE_BODY] = _of_meshes(meshes, params.reference, "reference")
-        out[MOVING_BODY] = _of_meshes(meshes, params.moving, "moving")
-        findings: Findings = ()
-    else:
-        findings = _of_labels(reads, params, out)
-    out[SURFACE_ORIGINS] = _origins(params, present)
-    return findings + _missing_surfaces(params, present)
+    names = (*params.reference, *params.moving)
+    present = [name for name in names if name in reads[CASE_FACTS].structures]
+    reference, moving, findings = _labelled(reads, params, out)
+    made = _made(Labelled(reference, moving, tuple(n for n in names if n not in present)), reads[ANATOMY], params, out)
+    out[MADE_MESHES] = made.meshes
+    out[REFERENCE_BODY] = _joined(reference, [made.meshes[name] for name in made.reference])
+    out[MOVING_BODY] = _joined(moving, [made.meshes[name] for name in made.moving])
+    out[SURFACE_ORIGINS] = _origins(params, present, made)
+    return findings + made.findings + _missing_surfaces(names, (*present, *filled_in(names, made)))
+
+
+class Labelled(NamedTuple):
+    """Both bodies as labelled, and the structures that are missing on them."""
+
+    reference: TriangleMesh
+    moving: TriangleMesh
+    missing: tuple[str, ...]
+
+
+def _labelled(reads: Inputs, params: Params, out: Outputs) -> tuple[TriangleMesh, TriangleMesh, Findings]:
+    if reads[CASE_FACTS].source == "labels":
+        return _of_labels(reads, params, out)
+    meshes = reads[MESHES]
+    return _of_meshes(meshes, params.reference, "reference"), _of_meshes(meshes, params.moving, "moving"), ()
+
+
+def _made(labelled: Labelled, anatomy: Anatomy, params: Params, out: Outputs) -> Made:
+    """What is missing, made from what is there, where that is wanted."""
+    if params.missing_surfaces == "leave":
+        return NOTHING_MADE
+    request = Request(
+        names=labelled.missing,
+        reference=labelled.reference,
+        moving=labelled.moving,
+        anatomy=anatomy,
+        bounds=params.made.bounds(),
+        triangle_mm2=params.made.triangle_mm2,
+        filler=params.missing_surfaces == "filler",
+    )
+    return make_surfaces(request, out.jobs)
+
+
+def _joined(body: TriangleMesh, more: list[TriangleMesh]) -> TriangleMesh:
+    return merged([body, *more]) if more else body
 
 
 def _of_meshes(meshes: Mapping[str, TriangleMesh], names: list[str], body: str) -> TriangleMesh:
@@ -58,7 +169,7 @@ def _no_surface(body: str, error: ValueError) -> CaseRejected:
     )
 
 
-def _of_labels(reads: Inputs, params: Params, out: Outputs) -> Findings:
+def _of_labels(reads: Inputs, params: Params, out: Outputs) -> tuple[TriangleMesh, TriangleMesh, Findings]:
     given, facts, anatomy = reads[LABELS], reads[CASE_FACTS], reads[ANATOMY]
     if given is None:
         raise ValueError("a case of labels has no label volume")
@@ -66,7 +177,8 @@ def _of_labels(reads: Inputs, params: Params, out: Outputs) -> Findings:
     reference, moving = _values(facts, params.reference), _values(facts, params.moving)
     settings = SurfaceSettings(triangles=params.triangles)
     results = meshes_of([_task(near, reference, moving, settings), _task(near, moving, reference, settings)], out.jobs)
-    return tuple(_kept(body, result, out) for body, result in zip(("reference", "moving"), results, strict=True))
+    first, second = (_kept(body, result) for body, result in zip(("reference", "moving"), results, strict=True))
+    return first.mesh, second.mesh, (_described("reference", first), _described("moving", second))
 
 
 def _task(near: LabelVolume, own: list[int], other: list[int], settings: SurfaceSettings) -> SurfaceTask:
@@ -74,11 +186,10 @@ def _task(near: LabelVolume, own: list[int], other: list[int], settings: Surface
     return SurfaceTask(voxels_of(part.values, own), part.lps_from_index, settings, voxels_of(part.values, other))
 
 
-def _kept(body: str, result: SurfaceResult | ValueError, out: Outputs) -> Finding:
+def _kept(body: str, result: SurfaceResult | ValueError) -> SurfaceResult:
     if isinstance(result, ValueError):
         raise _no_surface(body, result) from result
-    out[REFERENCE_BODY if body == "reference" else MOVING_BODY] = result.mesh
-    return _described(body, result)
+    return result
 
 
 def _described(name: str, result: SurfaceResult) -> Finding:
@@ -107,13 +218,20 @@ def _near_joint(labels: LabelVolume, anatomy: Anatomy, reach_mm: float) -> Label
     return LabelVolume(values, matrix)
 
 
-def _origins(params: Params, present: list[str]) -> tuple[SurfaceOrigin, ...]:
-    rows = [("reference", name) for name in params.reference] + [("moving", name) for name in params.moving]
-    return tuple(SurfaceOrigin(body, name, "labelled" if name in present else "absent") for body, name in rows)  # type: ignore[arg-type]
+def _origins(params: Params, present: list[str], made: Made) -> tuple[SurfaceOrigin, ...]:
+    def origin(name: str) -> Literal["labelled", "synthesised", "absent"]:
+        return "labelled" if name in present else "synthesised" if name in made.meshes else "absent"
+
+    reference = [*params.reference, *(name for name in made.reference if name not in params.reference)]
+    moving = [*params.moving, *(name for name in made.moving if name not in params.moving)]
+    return (
+        *(SurfaceOrigin("reference", name, origin(name)) for name in reference),
+        *(SurfaceOrigin("moving", name, origin(name)) for name in moving),
+    )
 
 
-def _missing_surfaces(params: Params, present: list[str]) -> Findings:
-    absent = [name.replace("_", " ") for name in (*params.reference, *params.moving) if name not in present]
+def _missing_surfaces(names: tuple[str, ...], there: tuple[str, ...]) -> Findings:
+    absent = [name.replace("_", " ") for name in names if name not in there]
     if not absent:
         return ()
     message = f"Not labelled and therefore not part of the contact: {', '.join(absent)}."
@@ -124,7 +242,7 @@ STAGE = Stage(
     50,
     "contact",
     (CASE_FACTS, LABELS, MESHES, ANATOMY),
-    (REFERENCE_BODY, MOVING_BODY, SURFACE_ORIGINS),
+    (REFERENCE_BODY, MOVING_BODY, MADE_MESHES, SURFACE_ORIGINS),
     Params,
     run,
 )

@@ -13,6 +13,7 @@ from pipeline import __version__
 from pipeline.artifacts import (
     ANATOMY,
     CASE_FACTS,
+    MADE_MESHES,
     MESHES,
     MOVING_BODY,
     NEUTRAL_CURVE,
@@ -93,7 +94,7 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:  # noqa: ARG00
     files = {"lut.h5": encode_lut(_content(reads)), "README.txt": _readme(facts, reads[SURFACE_ORIGINS])}
     smooth = reads[SMOOTH_TABLE]
     files["lut.csv"] = encode_csv(smooth.grid, smooth.poses, facts.side)
-    meshes, report = reads[MESHES], reads[REPORT]
+    meshes, report = reads[MESHES] | reads[MADE_MESHES], reads[REPORT]
     files |= {**_mesh_files(meshes), **report}
     files["manifest.json"] = canonical_json(_manifest(reads, files))
     archive = f"{facts.case_id}_ct2lut"
@@ -169,6 +170,7 @@ STAGE = Stage(
     reads=(
         CASE_FACTS,
         MESHES,
+        MADE_MESHES,
         ANATOMY,
         REFERENCE_BODY,
         MOVING_BODY,

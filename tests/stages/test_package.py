@@ -17,6 +17,7 @@ import pytest
 from pipeline.artifacts import (
     ANATOMY,
     CASE_FACTS,
+    MADE_MESHES,
     MESHES,
     MOVING_BODY,
     NEUTRAL_CURVE,
@@ -90,6 +91,7 @@ def reads(side: Side = "right") -> Reads:
             ANATOMY.name: _anatomy(table, side),
             REFERENCE_BODY.name: table.reference_body,
             MOVING_BODY.name: table.moving_body,
+            MADE_MESHES.name: {},
             SURFACE_ORIGINS.name: origins,
             RAW_TABLE.name: table.raw,
             NEUTRAL_CURVE.name: table.neutral,

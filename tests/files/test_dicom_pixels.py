@@ -1,0 +1,175 @@
+"""Pixels of DICOM slices: CT numbers, padding, compressed frames that are cut or lie about their size."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydicom import dcmread
+from pydicom.uid import JPEGLSNearLossless
+
+from pipeline.errors import CaseRejected
+from pipeline.files.ct_volumes import CtScan
+from pipeline.files.dicom_headers import DicomHeader, read_header
+from pipeline.files.dicom_pixels import stored_pixels
+from pipeline.files.dicom_writer import SeriesSpec, encode_series
+from pipeline.geometry.volume import CtVolume
+from tests.files.dicom_samples import (
+    Files,
+    leg,
+    read,
+    series,
+    short,
+    with_edited,
+    written,
+)
+
+LEG = leg()
+FILES = series()
+MIDDLE, LAST = "IM0006.dcm", "IM0012.dcm"
+
+
+def refused(code: str, problem: str = "") -> pytest.RaisesExc[CaseRejected]:
+    return pytest.raises(CaseRejected, match=f"(?s)^{code} .*{problem}")
+
+
+def assert_same(found: CtScan, expected: CtVolume) -> None:
+    np.testing.assert_array_equal(found.volume.values, expected.values)
+    np.testing.assert_allclose(found.volume.lps_from_index, expected.lps_from_index, atol=1e-6)
+
+
+def codes(found: CtScan) -> list[str]:
+    return [finding.code for finding in found.findings]
+
+
+def headers_of(files: Files) -> list[DicomHeader]:
+    found = [read_header(data, name) for name, data in files.items()]
+    return [header for header in found if isinstance(header, DicomHeader)]
+
+
+def test_padding_becomes_air() -> None:  # D15
+    rim = LEG.values.copy()
+    rim[0] = -3024
+    expected = LEG.values.copy()
+    expected[0] = -1024
+    files = encode_series(CtVolume(rim, LEG.lps_from_index))
+    found = read(with_edited(files, {"PixelPaddingValue": short(-2000)}))
+    np.testing.assert_array_equal(found.volume.values, expected)
+    assert codes(found) == ["N-DCM-02"]
+
+
+def test_padding_far_outside_of_the_scale() -> None:  # D15
+    rim = LEG.values.copy()
+    rim[0] = -30_000
+    files = encode_series(CtVolume(rim, LEG.lps_from_index))
+    with refused("E-CT-02", "-30000"):
+        read(files)
+    found = read(with_edited(files, {"PixelPaddingValue": short(-30_000 + 1024)}))
+    assert set(found.volume.values[0].ravel()) == {-1024}
+
+
+def test_padding_that_is_tissue_is_left() -> None:
+    found = read(with_edited(FILES, {"PixelPaddingValue": short(int(LEG.values[10, 8, 5]) + 1024)}))
+    assert_same(found, LEG)
+    assert codes(found) == ["N-DCM-03"]
+
+
+def test_spare_bits_are_removed() -> None:
+    """Twelve bits stored, overlays in the upper four."""
+    header = headers_of({MIDDLE: FILES[MIDDLE]})[0]
+    begin, end = header.pixels
+    stored = np.frombuffer(FILES[MIDDLE][begin:end], "<u2")
+    dirty = FILES[MIDDLE][:begin] + (stored | 0xA000).astype("<u2").tobytes() + FILES[MIDDLE][end:]
+    for signed in (True, False):
+        found = stored_pixels(dirty, replace(header, bits_stored=12, high_bit=11, signed=signed))
+        expected = (stored.astype(np.int32) & 0xFFF) - 4096 * (signed & (stored >> 11 & 1).astype(np.int32))
+        np.testing.assert_array_equal(found, expected.reshape(20, 24))
+
+
+def test_a_slope_with_fractions() -> None:
+    found = read(with_edited(FILES, {"RescaleSlope": b"0.75"}))
+    stored = LEG.values.astype(np.float64) + 1024.0
+    np.testing.assert_array_equal(found.volume.values, np.rint(stored * 0.75 - 1024.0))
+    assert codes(found) == ["N-CT-01"]
+
+
+def test_near_lossless_pixels_are_looked_at() -> None:  # D16
+    files = {}
+    for name, data in FILES.items():
+        dataset = dcmread(io.BytesIO(data))
+        dataset.compress(JPEGLSNearLossless, jls_error=2, encoding_plugin="pyjpegls", generate_instance_uid=False)
+        files[name] = written(dataset)
+    found = read(files)
+    assert 0 < np.abs(found.volume.values.astype(int) - LEG.values).max() <= 2
+    assert codes(found) == ["W-DCM-01"]
+
+
+def test_lossy_pixels_are_looked_at() -> None:  # D16
+    found = read(with_edited(FILES, {"LossyImageCompression": b"01"}))
+    assert_same(found, LEG)
+    assert codes(found) == ["W-DCM-01"]
+    assert found.facts.lossy
+
+
+def test_one_voxel_too_bright() -> None:  # D19
+    values = LEG.values.copy()
+    values[10, 8, 5] = 31_000
+    assert codes(read(encode_series(CtVolume(values, LEG.lps_from_index)))) == ["W-CT-02"]
+
+
+@pytest.mark.parametrize("syntax", ["JPEG lossless", "JPEG-LS lossless", "JPEG 2000 lossless", "RLE"])
+def test_cut_inside_the_frame(syntax: str) -> None:
+    """The file is whole, its compressed picture is not: refused or, at the worst, the size is right."""
+    files = series(SeriesSpec(syntax=syntax))
+    header = headers_of({LAST: files[LAST]})[0]
+    begin, end = header.pixels
+    item = files[LAST][begin : end - 8]
+    frame = item[20:]
+    refusals = 0
+    for part in range(1, 8):
+        kept = frame[: len(frame) * part // 8 // 2 * 2]
+        items = item[:16] + len(kept).to_bytes(4, "little") + kept + b"\xfe\xff\xdd\xe0\0\0\0\0"
+        data = files[LAST][:begin] + items
+        cut = headers_of({LAST: data})[0]
+        try:
+            assert stored_pixels(data, cut).shape == (20, 24)
+        except CaseRejected as error:
+            assert error.code == "E-IO-11"  # noqa: PT017 - some cuts decode, to the right size
+            refusals += 1
+    assert refusals
+
+
+def test_a_compressed_frame_of_another_size() -> None:  # D21
+    for syntax in ("JPEG lossless", "JPEG-LS lossless", "JPEG 2000 lossless", "RLE"):
+        with refused("E-IO-11", "cannot be decoded to 24 x 40"):
+            read(with_edited(series(SeriesSpec(syntax=syntax)), {"Rows": short(40)}))
+
+
+@pytest.mark.parametrize("syntax", ["explicit little endian", "RLE"])
+def test_pixels_of_another_size_than_the_header_never_come_out(syntax: str) -> None:
+    data = series(SeriesSpec(syntax=syntax))[MIDDLE]
+    header = headers_of({MIDDLE: data})[0]
+    with refused("E-IO-11", "cannot be decoded to 24 x 21"):
+        stored_pixels(data, replace(header, rows=21))
+
+
+@pytest.mark.parametrize("syntax", ["JPEG lossless", "JPEG-LS lossless", "JPEG 2000 lossless"])
+def test_no_decoder_sees_a_cut_frame_or_one_of_another_size(syntax: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """GDCM aborts the process on the one, pyjpegls works for seconds on the other."""
+    data = series(SeriesSpec(syntax=syntax))[MIDDLE]
+    header = headers_of({MIDDLE: data})[0]
+    end = header.pixels[1]
+
+    def reached(_: object) -> None:
+        raise AssertionError("the decoder was reached")
+
+    monkeypatch.setattr("pydicom.pixels.decoders.base.get_decoder", reached)
+    with refused("E-IO-11", "cannot be decoded"):
+        stored_pixels(data, replace(header, rows=40))
+    without_its_end = data[: end - 16] + bytes(8) + data[end - 8 :]
+    with refused("E-IO-11", "cannot be decoded"):
+        stored_pixels(without_its_end, header)
+    with pytest.raises(AssertionError, match="reached"):
+        stored_pixels(data, header)
