@@ -48,8 +48,8 @@ setup:  ## install everything into .venv (once; checks in a moment that nothing 
 setup-dev:
 	@tools/setup.sh dev
 
-demo: setup  ## make a knee, process it, show where the report is
-	@[ -d build/demo/cases/demo ] || $(BIN)/ct2lut phantom build/demo/cases --id demo
+demo: setup  ## make a synthetic CT of a knee (DICOM, no labels), process it, show where the report is
+	@[ -d build/demo/cases/demo ] || $(BIN)/ct2lut phantom build/demo/cases --id demo --ct
 	@$(BIN)/ct2lut run demo --cases build/demo/cases --results build/demo/results --protocol demo $(LOOK)
 
 demo-real: setup  ## the same with a real knee, segmented from MR (fetches 90 MB the first time)

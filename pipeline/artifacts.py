@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from pipeline.engine.artifacts import folder
 from pipeline.engine.records import record_artifact
-from pipeline.files.arrays import array_artifact, label_volume_artifact, mesh_artifact, mesh_set_artifact
+from pipeline.files.arrays import (
+    array_artifact,
+    ct_volume_artifact,
+    label_volume_artifact,
+    mesh_artifact,
+    mesh_set_artifact,
+)
 from pipeline.kinematics.neutral import NeutralCurve
 from pipeline.kinematics.table import RawTable, SmoothTable
 from pipeline.records import (
@@ -19,10 +25,15 @@ from pipeline.records import (
 )
 
 # 10_intake
-CASE_FACTS = record_artifact("case_facts", "case.json", CaseFacts)
-LABELS = label_volume_artifact("labels", "labels.nrrd")  # None where the case brought meshes
+GIVEN_FACTS = record_artifact("given_facts", "given.json", CaseFacts)
+GIVEN_LABELS = label_volume_artifact("given_labels", "given_labels.nrrd")  # None where the case brought none
+CT = ct_volume_artifact("ct", "ct.nrrd")  # None where the case brought none
 GIVEN_MESHES = mesh_set_artifact("given_meshes", "given_meshes.npz")  # empty where the case brought labels
 LIGAMENTS = record_artifact("ligaments", "ligaments.json", tuple[LigamentFibre, ...])  # empty where it brought none
+
+# 20_segment
+CASE_FACTS = record_artifact("case_facts", "case.json", CaseFacts)
+LABELS = label_volume_artifact("labels", "labels.nrrd")  # given, or found in the CT; None where the case brought meshes
 
 # 30_mesh
 MESHES = mesh_set_artifact("meshes", "meshes.npz")

@@ -220,6 +220,9 @@ def phantom(
     numbers: Annotated[
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change one number of the knee or the scan.")
     ] = None,
+    ct: Annotated[
+        bool, typer.Option("--ct", help="Make a synthetic CT (DICOM) without labels, not a label map.")
+    ] = False,
 ) -> None:
     """Make a knee to try the program with.
 
@@ -231,7 +234,7 @@ def phantom(
     from pipeline.request import phantom_spec
 
     place = folder / check_case_id(case_id)
-    write_phantom_case(place, phantom_spec(numbers or ()))
+    write_phantom_case(place, phantom_spec(numbers or ()), as_ct=ct)
     _say(f"made the case {place}")
 
 

@@ -158,18 +158,16 @@ def _area_mm2(mask: SurfaceMask) -> float:
 
 def _findings(meshes: Collection[str], spaces: dict[str, JointSpace], turned_deg: float) -> Findings:
     words = ", ".join(name.replace("_", " ") for name in meshes)
-    apart = " and ".join(f"{space.between_mm:.1f} mm {name}" for name, space in spaces.items())
+    apart = " and ".join(f"{space.between_mm:.1f} mm apart {name}ly" for name, space in spaces.items())
     out = [
         Finding(
             "N-CON-02",
             Severity.NOTE,
-            f"Made from the bones, not seen in the scan: {words}. The bones are {apart}ly apart at the scan pose.",
+            f"Made from the bones, not seen in the scan: {words}. At the scan pose the bones are {apart}.",
         )
     ]
     if not all(space.from_scan for space in spaces.values()):
-        message = (
-            f"The bones are {apart}ly apart, which is no joint space: made cartilage has the protocol's thickness."
-        )
+        message = f"The bones are {apart}, which is no joint space: made cartilage has the protocol's thickness."
         out.append(Finding("W-CON-02", Severity.REVIEW, message))
     if turned_deg:
         message = (

@@ -25,8 +25,8 @@ class CaseFacts:
         Name of the joint file, such as ``knee``.
     side : "right" or "left"
         As declared; confirmed by anatomy later.
-    source : "labels" or "meshes"
-        What the case brought.
+    source : "ct", "labels" or "meshes"
+        Where the bones come from: found in a CT, or as the case brought them.
     source_files : dict of str to str
         Input file name (relative to the case folder) -> SHA-256.
     structures : dict of str to int
@@ -46,7 +46,7 @@ class CaseFacts:
     case_id: str
     joint: str
     side: Side
-    source: Literal["labels", "meshes"]
+    source: Literal["ct", "labels", "meshes"]
     source_files: dict[str, str]
     structures: dict[str, int]
     voxels: dict[str, int]

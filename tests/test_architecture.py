@@ -33,6 +33,10 @@ WRAPPED = {
     "SimpleITK",
     "nibabel",
     "nrrd",
+    "pydicom",
+    "highdicom",
+    "gdcm",
+    "jpeg_ls",
 }
 #: What maths may not see: paths, settings, logs, processes, the wrapped libraries.
 IMPURE = WRAPPED | {
@@ -179,7 +183,7 @@ def test_artifacts_have_one_writer_and_are_read_after_it() -> None:
 
 #: A unit, or a word for a number that has none.
 UNITS = re.compile(
-    r"_(mm|mm2|mm3|deg|rad|fraction|ratio|percent|px|n|n_per_mm|per_mm|voxels|hz|s)$"
+    r"_(mm|mm2|mm3|deg|rad|fraction|ratio|percent|px|n|n_per_mm|per_mm|voxels|hz|hu|s)$"
     r"|count|degree|iterations|size|seed|triangles|width|height|order|number|band|samples|starts|factor|depth|limit|passes|points|cells|clusters"
 )
 

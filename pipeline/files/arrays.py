@@ -22,7 +22,7 @@ from pipeline.engine.artifacts import Artifact, single
 from pipeline.errors import CaseRejected
 from pipeline.files.nrrd_format import encode_nrrd, read_nrrd
 from pipeline.geometry.mesh import TriangleMesh
-from pipeline.geometry.volume import LabelVolume
+from pipeline.geometry.volume import CtVolume, LabelVolume
 
 T = TypeVar("T")
 
@@ -71,6 +71,11 @@ def mesh_set_artifact(name: str, file: str) -> Artifact[dict[str, TriangleMesh]]
 def label_volume_artifact(name: str, file: str) -> Artifact[LabelVolume | None]:
     """An artifact that is one label volume (``.nrrd``), or an empty file for None."""
     return single(name, file, lambda volume: b"" if volume is None else encode_nrrd(volume), _decode_label_volume)
+
+
+def ct_volume_artifact(name: str, file: str) -> Artifact[CtVolume | None]:
+    """An artifact that is one CT (``.nrrd``), or an empty file for None."""
+    return single(name, file, lambda volume: b"" if volume is None else encode_nrrd(volume), _decode_ct_volume)
 
 
 def pack(members: Mapping[str, NDArray[Any]]) -> bytes:
@@ -227,10 +232,24 @@ def _decode_mesh_set(data: bytes) -> dict[str, TriangleMesh]:
 def _decode_label_volume(data: bytes) -> LabelVolume | None:
     if not data:
         return None
+    values, lps_from_index = _decoded_nrrd(data)
+    if values.dtype.name not in ("uint8", "uint16"):
+        raise ValueError(f"expected labels of 8 or 16 bits, got {values.dtype}")
+    return LabelVolume(values, lps_from_index)
+
+
+def _decode_ct_volume(data: bytes) -> CtVolume | None:
+    if not data:
+        return None
+    values, lps_from_index = _decoded_nrrd(data)
+    if values.dtype.name != "int16":
+        raise ValueError(f"expected CT numbers of 16 bits, got {values.dtype}")
+    return CtVolume(values, lps_from_index)
+
+
+def _decoded_nrrd(data: bytes) -> tuple[NDArray[Any], NDArray[np.float64]]:
     try:
-        image = read_nrrd(data, "labels.nrrd")
+        image = read_nrrd(data, "volume.nrrd")
     except CaseRejected as error:
         raise ValueError(error.problem) from error
-    if image.values.dtype.name not in ("uint8", "uint16"):
-        raise ValueError(f"expected labels of 8 or 16 bits, got {image.values.dtype}")
-    return LabelVolume(image.values, image.lps_from_index)
+    return image.values, image.lps_from_index

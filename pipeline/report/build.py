@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import metadata, resources
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 
 from pipeline import __version__
 from pipeline.engine.stage import Findings
-from pipeline.records import Verdict
+from pipeline.records import SurfaceOrigin, Verdict
 from pipeline.report.evidence import CURVES, STATUS_WORDS, Evidence, cell, neutral_varus, plain, shown_flexions
 from pipeline.report.figure_frame import RESEARCH_USE
 from pipeline.report.figures import Drawn
@@ -22,6 +23,10 @@ TEMPLATE = "report.html.j2"
 STYLE = "report.css"
 #: Packages whose version can change a number or a picture.
 PACKAGES = ("numpy", "scipy", "vtk", "python-fcl", "opencv-python-headless", "matplotlib")
+#: Where the bones come from, for the headline.
+SOURCE_WORDS = {"ct": "a CT", "labels": "a label map", "meshes": "meshes"}
+#: Folders of more files are one row of the list of inputs.
+MOST_FILES_LISTED = 20
 ORIGIN_WORDS = {
     "labelled": "labelled in the scan",
     "synthesised": "MADE BY THE PROGRAM, not seen in the scan",
@@ -71,11 +76,13 @@ def _context(page: Page) -> dict[str, Any]:
         "software": f"ct2lut {__version__}",
         "packages": [(name, metadata.version(name)) for name in PACKAGES],
         "facts": evidence.facts,
+        "origin_of_bones": SOURCE_WORDS[evidence.facts.source],
+        "sources": _sources(evidence.facts.source_files),
         "anatomy": evidence.anatomy,
         "mesh_quality": evidence.mesh_quality,
         "verdict": page.verdict,
         "more_reasons": _count_of_reviews(page) - len(page.verdict.reasons),
-        "origins": [_origin_row(origin.body, origin.structure, origin.origin) for origin in evidence.origins],
+        "origins": [_origin_row(origin, evidence.facts.source) for origin in evidence.origins],
         "made": [plain(o.structure) for o in evidence.origins if o.origin == "synthesised"],
         "figures": [_figure(item) for item in page.figures],
         "curves": CURVES,
@@ -89,8 +96,23 @@ def _count_of_reviews(page: Page) -> int:
     return len({finding.message for finding in every if finding.severity == "review"})
 
 
-def _origin_row(body: str, structure: str, origin: str) -> tuple[str, str, str, str]:
-    return plain(structure), BODY_WORDS[body], ORIGIN_WORDS[origin], origin
+def _origin_row(origin: SurfaceOrigin, source: str) -> tuple[str, str, str, str]:
+    found = source == "ct" and origin.origin == "labelled"
+    words = "found in the CT by the program" if found else ORIGIN_WORDS[origin.origin]
+    return plain(origin.structure), BODY_WORDS[origin.body], words, origin.origin
+
+
+def _sources(files: Mapping[str, str]) -> list[tuple[str, str]]:
+    """Name and SHA-256 of every input file; those of a folder as one, by the hash of their names and hashes."""
+    rows = [(name, digest) for name, digest in sorted(files.items()) if "/" not in name]
+    for folder in sorted({name.split("/")[0] for name in files if "/" in name}):
+        inside = [(name, digest) for name, digest in sorted(files.items()) if name.startswith(f"{folder}/")]
+        if len(inside) <= MOST_FILES_LISTED:
+            rows += inside
+        else:
+            whole = hashlib.sha256("".join(f"{digest}  {name}\n" for name, digest in inside).encode()).hexdigest()
+            rows.append((f"{folder}/ ({len(inside)} files, one SHA-256 over the list of all)", whole))
+    return rows
 
 
 def _figure(item: Drawn) -> dict[str, Any]:

@@ -15,13 +15,11 @@ from pipeline.geometry.views import View, view
 from pipeline.report.evidence import STATUS_WORDS, Cell, Evidence, cell_motion, plain, shown_cells
 from pipeline.report.figure_bones import SIDES, half_height_mm
 from pipeline.report.figure_frame import finished, mark_edges, title_panel, words_panel
-from pipeline.report.palette import BONE, MADE, MOVING, OVERLAP, scale, structure_color
+from pipeline.report.palette import BONE, MOVING, OVERLAP, scale, structure_color
 from pipeline.report.settings import PictureSettings
 
 Float = NDArray[np.float64]
 
-#: A vertex farther than this from every labelled surface belongs to one that was made; above mesh and label error.
-MADE_BEYOND_MM = 1.0
 #: Overlap that is coloured as such; the eye sees no less (0.145 mm is one arc minute from 0.5 m).
 OVERLAP_MM = 0.145
 CONTACT_SHARE = 1.1
@@ -93,20 +91,16 @@ def _pose_column(
 
 
 def body_colors(evidence: Evidence, body: str) -> NDArray[np.uint8]:
-    """(N, 3) colour of each vertex of a body: that of the labelled structure it lies on, or of what was made."""
+    """(N, 3) colour of each vertex of a body: that of the structure it lies on."""
     mesh = evidence.reference if body == "reference" else evidence.moving
     names = [o.structure for o in evidence.origins if o.body == body and o.structure in evidence.meshes]
-    made = any(o.origin == "synthesised" for o in evidence.origins if o.body == body)
     if not names:
         return np.tile(np.array(BONE if body == "reference" else MOVING, dtype=np.uint8), (len(mesh.points), 1))
     vertices = [evidence.meshes[name].points for name in names]
     structure = np.repeat(np.arange(len(names)), [len(points) for points in vertices])
-    distance, nearest = _nearest_vertex(mesh.points, np.concatenate(vertices))
+    _, nearest = _nearest_vertex(mesh.points, np.concatenate(vertices))
     palette = np.array([structure_color(name) for name in names], dtype=np.uint8)
-    colors: NDArray[np.uint8] = palette[structure[nearest]]
-    if made:
-        colors[distance > MADE_BEYOND_MM] = MADE
-    return colors
+    return np.asarray(palette[structure[nearest]])
 
 
 def _nearest_vertex(points: Float, vertices: Float, reach_mm: float = np.inf) -> tuple[Float, NDArray[np.intp]]:
@@ -118,10 +112,12 @@ def _nearest_vertex(points: Float, vertices: Float, reach_mm: float = np.inf) ->
 
 
 def _pose_legend(evidence: Evidence) -> list[tuple[str, Color]]:
-    shown = [o.structure for o in evidence.origins if o.origin == "labelled" and o.structure in evidence.meshes]
-    legend = [(plain(name), structure_color(name)) for name in shown]
-    made = [plain(o.structure) for o in evidence.origins if o.origin == "synthesised"]
-    return [*legend, *([(f"made by the program: {', '.join(made)}", MADE)] if made else [])]
+    words = {"labelled": "{}", "synthesised": "{} (made by the program)"}
+    return [
+        (words[o.origin].format(plain(o.structure)), structure_color(o.structure))
+        for o in evidence.origins
+        if o.origin in words and o.structure in evidence.meshes
+    ]
 
 
 def contact_picture(evidence: Evidence, settings: PictureSettings) -> Image:

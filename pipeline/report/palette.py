@@ -15,7 +15,6 @@ Color = tuple[int, int, int]
 BONE: Color = (233, 225, 204)
 REFERENCE: Color = (233, 225, 204)
 MOVING: Color = (186, 205, 224)
-MADE: Color = (204, 121, 167)
 OVERLAP: Color = (213, 94, 0)
 AXIS: Color = (0, 90, 160)
 DELTA: Color = (200, 60, 0)

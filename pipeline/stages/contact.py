@@ -128,7 +128,7 @@ class Labelled(NamedTuple):
 
 
 def _labelled(reads: Inputs, params: Params, out: Outputs) -> tuple[TriangleMesh, TriangleMesh, Findings]:
-    if reads[CASE_FACTS].source == "labels":
+    if reads[CASE_FACTS].source != "meshes":
         return _of_labels(reads, params, out)
     meshes = reads[MESHES]
     return _of_meshes(meshes, params.reference, "reference"), _of_meshes(meshes, params.moving, "moving"), ()

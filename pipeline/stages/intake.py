@@ -7,16 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field, StringConstraints
 
-from pipeline.artifacts import CASE_FACTS, GIVEN_MESHES, LABELS, LIGAMENTS
+from pipeline.artifacts import CT, GIVEN_FACTS, GIVEN_LABELS, GIVEN_MESHES, LIGAMENTS
 from pipeline.engine.artifacts import SOURCE, SourceFolder
 from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage, StrictParams
 from pipeline.errors import CaseRejected
-from pipeline.files.case_files import CaseFiles, choose_files, read_file
+from pipeline.files.case_files import CT_FOLDER, CaseFiles, choose_files, read_file
+from pipeline.files.ct_volumes import CtScan, read_ct_volume
 from pipeline.files.ligaments_file import read_ligaments
 from pipeline.files.markups import read_markups
 from pipeline.files.meshes import read_mesh
@@ -74,15 +76,22 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     files = choose_files(source.files)
     facts = _common_facts(source, files, params, side)
     out[LIGAMENTS] = _ligaments(source, files.ligaments)
-    if files.label_map is None:
+    scan = _ct(source, files.ct, side)
+    out[CT] = None if scan is None else scan.volume
+    seen = () if scan is None else (*scan.findings, *_set_aside(scan))
+    if files.label_map is not None:
+        label_map = read_label_map(read_file(source, files.label_map), files.label_map)
+        return seen + _take_labels(label_map, files.label_map, params, facts, out)
+    out[GIVEN_LABELS] = None
+    if files.meshes:
         meshes, findings = _given_meshes(source, files.meshes, params, out)
-        out[CASE_FACTS], out[LABELS], out[GIVEN_MESHES] = _facts_of_meshes(facts, meshes), None, meshes
-        return findings
-    label_map = read_label_map(read_file(source, files.label_map), files.label_map)
-    return _take_labels(label_map, files.label_map, params, facts, out)
+        out[GIVEN_FACTS], out[GIVEN_MESHES] = _facts_of_meshes(facts, meshes), meshes
+        return seen + findings
+    out[GIVEN_FACTS], out[GIVEN_MESHES] = facts, {}
+    return seen
 
 
-STAGE = Stage(10, "intake", (SOURCE,), (CASE_FACTS, LABELS, GIVEN_MESHES, LIGAMENTS), Params, run)
+STAGE = Stage(10, "intake", (SOURCE,), (GIVEN_FACTS, GIVEN_LABELS, CT, GIVEN_MESHES, LIGAMENTS), Params, run)
 
 
 def _declared_side(params: Params) -> Side:
@@ -102,7 +111,7 @@ def _common_facts(source: SourceFolder, files: CaseFiles, params: Params, side: 
         case_id=source.case_id,
         joint=params.joint,
         side=side,
-        source="meshes" if files.label_map is None else "labels",
+        source="labels" if files.label_map else "meshes" if files.meshes else "ct",
         source_files={name: source.files[name] for name in files.names},
         structures={},
         voxels={},
@@ -111,6 +120,38 @@ def _common_facts(source: SourceFolder, files: CaseFiles, params: Params, side: 
         clipped_mm2={},
         landmarks={} if landmarks is None else read_markups(read_file(source, landmarks), landmarks),
     )
+
+
+def _ct(source: SourceFolder, names: tuple[str, ...], side: Side) -> CtScan | None:
+    """The CT of the case.
+
+    Raises
+    ------
+    CaseRejected
+        E-SIDE-03 where its files name the other side; E-DCM-*, E-CT-*, E-IO-*, E-GEO-*.
+    """
+    if not names:
+        return None
+    if names[0].startswith(CT_FOLDER):
+        from pipeline.files.dicom_series import read_dicom_series  # noqa: PLC0415 - pydicom, not for a cached run
+
+        scan = read_dicom_series(names, partial(read_file, source))
+    else:
+        scan = read_ct_volume(read_file(source, names[0]), names[0])
+    if scan.laterality not in (None, side):
+        raise CaseRejected(
+            "E-SIDE-03",
+            f"The case is declared {side}, and every slice of the CT says {scan.laterality}.",
+            "Correct 'side:' in case.yaml, or give the CT of the other leg.",
+        )
+    return scan
+
+
+def _set_aside(scan: CtScan) -> Findings:
+    if not scan.set_aside or any(finding.code == "N-DCM-01" for finding in scan.findings):
+        return ()
+    listed = ", ".join(f"{name} ({why})" for name, why in scan.set_aside[:8])
+    return (Finding("N-DCM-01", Severity.NOTE, f"Not part of the CT and set aside: {listed}."),)
 
 
 def _ligaments(source: SourceFolder, file: str | None) -> tuple[LigamentFibre, ...]:
@@ -151,8 +192,8 @@ def _take_labels(label_map: LabelMap, file: str, params: Params, facts: CaseFact
     values, notes = structure_values(label_map.segments, params.labels, params.wanted, file)
     structures = number_structures(values, label_map.counts, params.required, file)
     volume, repairs = _cleaned(renumbered(label_map.volume, values, structures), structures, out)
-    out[CASE_FACTS] = _facts_of_labels(facts, volume, structures, repairs)
-    out[LABELS] = volume
+    out[GIVEN_FACTS] = _facts_of_labels(facts, volume, structures, repairs)
+    out[GIVEN_LABELS] = volume
     out[GIVEN_MESHES] = {}
     used = [values[name] for name in structures]
     return (

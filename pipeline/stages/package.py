@@ -36,7 +36,7 @@ from pipeline.geometry.mesh import TriangleMesh
 from pipeline.records import CaseFacts, SurfaceOrigin
 
 #: Findings of every stage before this one, in order; one object each, since artifacts are told apart by identity.
-_STAGES = ("intake", "mesh", "anatomy", "contact", "sweep", "smooth", "qa")
+_STAGES = ("intake", "segment", "mesh", "anatomy", "contact", "sweep", "smooth", "qa")
 _SETTINGS = {name: settings_of(name) for name in _STAGES}
 _FINDINGS = {name: findings_of(name) for name in _STAGES}
 

@@ -36,7 +36,7 @@ from pipeline.report.metrics import all_metrics
 from pipeline.report.settings import Limits, PictureSettings
 from pipeline.report.verdict import judge, metric_findings, picture_findings
 
-FINDINGS = {name: findings_of(name) for name in ("intake", "mesh", "anatomy", "contact", "sweep", "smooth")}
+FINDINGS = {name: findings_of(name) for name in ("intake", "segment", "mesh", "anatomy", "contact", "sweep", "smooth")}
 
 #: The longest first, and the charts side by side: a worker that has drawn the one has loaded what draws the other.
 DRAWING_ORDER = ("poses", "curves", "checks", "slices", "contact", "bones")

@@ -16,7 +16,7 @@ from pipeline.files.phantom_case import write_phantom_case
 from pipeline.flow import FLOW
 from pipeline.geometry.phantom_spec import PhantomSpec
 from pipeline.records import Anatomy
-from tests.end_to_end.knee_runs import Silent, left
+from tests.end_to_end.knee_runs import Silent, left, up_to
 
 REAL_KNEE = Path(__file__).resolve().parents[3] / "shared" / "data" / "knee_mr_a"
 
@@ -42,7 +42,7 @@ def knee(name: str, case: Path, folder: Path, triangles: int) -> Knee:
     """The contact bodies of a case with so many triangles each."""
     settings = load_settings(FLOW, case, "clinical", (f"contact.triangles={triangles}",))
     job = CaseJob(name, case, folder / "bodies" / name)
-    run_case(job, FLOW[:4], settings, Execution(jobs=2), Silent())
+    run_case(job, up_to("contact"), settings, Execution(jobs=2), Silent())
     anatomy = left(job.results, ANATOMY)
     reference = left(job.results, REFERENCE_BODY)
     moving = left(job.results, MOVING_BODY)

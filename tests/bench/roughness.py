@@ -22,9 +22,8 @@ from pipeline.engine.outcome import Execution
 from pipeline.engine.runner import CaseJob, run_case
 from pipeline.flow import FLOW
 from pipeline.kinematics.table import Float
-from tests.end_to_end.knee_runs import Silent, left
+from tests.end_to_end.knee_runs import Silent, left, up_to
 
-SWEEP = 5
 NARROW = ("sweep.varus_min_deg=-3", "sweep.varus_max_deg=3", "sweep.cross_check_fraction=0")
 
 
@@ -58,7 +57,7 @@ def line(case: Path, surface: Surface) -> str:
         job = CaseJob(case.name, case, Path(folder) / case.name)
         made = partial(SurfaceSettings, iterations=surface.iterations, pass_bands=(surface.pass_band,))
         with patch("pipeline.stages.contact.SurfaceSettings", made):
-            run_case(job, FLOW[:SWEEP], settings, Execution(jobs=2), Silent())
+            run_case(job, up_to("sweep"), settings, Execution(jobs=2), Silent())
         raw, after = left(job.results, RAW_TABLE), left(job.results, SWEEP_FACTS).jumps_after
         settled = [one for one in left(job.results, SCAN_RETURNS) if one.settled]
     return (

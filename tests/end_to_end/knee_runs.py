@@ -26,8 +26,14 @@ from pipeline.kinematics.table import PoseTable
 
 T = TypeVar("T")
 
+
+def up_to(name: str) -> tuple[Stage, ...]:
+    """The flow up to a stage."""
+    return FLOW[: 1 + [stage.name for stage in FLOW].index(name)]
+
+
 #: Up to the smoothed table: the numbers, without pictures and package.
-NUMBERS = FLOW[:6]
+NUMBERS = up_to("smooth")
 
 #: A grid and meshes small enough for a test, coarse enough to be quick.
 COARSE = (

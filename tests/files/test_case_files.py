@@ -12,7 +12,7 @@ from pipeline.errors import CaseRejected
 from pipeline.files import case_files
 from pipeline.files.case_files import choose_files, read_file
 
-OTHERS = ["case.yaml", "labels.json", "ct/0001.dcm", "notes/labels.nrrd", "meshes/readme.txt", "ct.nii.gz"]
+OTHERS = ["case.yaml", "labels.json", "notes/labels.nrrd", "meshes/readme.txt", "ctlike.nii.gz"]
 
 
 @pytest.mark.parametrize(
@@ -22,6 +22,15 @@ def test_one_label_map(name: str) -> None:
     chosen = choose_files([*OTHERS, name])
     assert (chosen.label_map, dict(chosen.meshes), chosen.landmarks, chosen.ligaments) == (name, {}, None, None)
     assert chosen.names == (name,)
+
+
+@pytest.mark.parametrize("names", [["ct/2.dcm", "ct/1", "ct/more/3"], ["ct.nii.gz"], ["CT.nrrd"], ["ct.mha"]])
+@pytest.mark.parametrize("labels", [[], ["labels.nrrd"]])
+def test_a_ct_alone_or_beside_labels(names: list[str], labels: list[str]) -> None:
+    chosen = choose_files(["case.yaml", *names, *labels])
+    assert chosen.ct == tuple(sorted(names))
+    assert chosen.label_map == (labels[0] if labels else None)
+    assert set(chosen.names) == {*names, *labels}
 
 
 def test_meshes_and_landmarks() -> None:
@@ -41,7 +50,9 @@ def test_ligaments(name: str) -> None:
 @pytest.mark.parametrize(
     ("names", "code", "problem"),
     [
-        (OTHERS, "E-IO-15", r"holds no label map; it holds case.yaml, ct.nii.gz, labels.json"),
+        (OTHERS, "E-IO-15", r"holds neither a CT nor a label map; it holds case.yaml, ctlike.nii.gz, labels.json"),
+        (["ct/1.dcm", "ct.nrrd"], "E-IO-16", r"more than one CT: ct\.nrrd, ct/"),
+        (["ct.nii.gz", "CT.MHA"], "E-IO-16", r"more than one CT: CT\.MHA, ct\.nii\.gz"),
         ([], "E-IO-15", "no files"),
         (["labels.nii", "labels.nii.gz"], "E-IO-16", r"more than one segmentation: labels\.nii, labels\.nii\.gz"),
         (["labels.nii", "a.seg.nrrd"], "E-IO-16", r"a\.seg\.nrrd, labels\.nii"),

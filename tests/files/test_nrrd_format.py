@@ -39,7 +39,7 @@ def test_simpleitk_reads_the_same(tmp_path: Path) -> None:
     np.testing.assert_allclose(there, (KNEE.lps_from_index @ (3.0, 4.0, 5.0, 1.0))[:3], atol=1e-9)
 
 
-@pytest.mark.parametrize("values", [np.zeros((2, 2, 2), np.int16), np.zeros((2, 2), np.uint8)])
+@pytest.mark.parametrize("values", [np.zeros((2, 2, 2), np.int32), np.zeros((2, 2), np.uint8)])
 def test_only_label_volumes_are_written(values: np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> None:
-    with pytest.raises(ValueError, match="expected a uint8 or uint16 volume"):
+    with pytest.raises(ValueError, match="expected a uint8, uint16 or int16 volume"):
         encode_nrrd(LabelVolume(values, np.eye(4)))

@@ -54,7 +54,7 @@ SWEEP = SweepFacts(
         shallower_mm=0.02,
     ),
 )
-STAGES = ("intake", "mesh", "anatomy", "contact", "sweep", "smooth")
+STAGES = ("intake", "segment", "mesh", "anatomy", "contact", "sweep", "smooth")
 
 
 def sample_evidence(side: Side = "right", case_id: str = "SAMPLE-1") -> Evidence:

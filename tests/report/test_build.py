@@ -157,3 +157,14 @@ def test_the_table_shows_values_and_says_where_there_are_none() -> None:
 )
 def test_numbers_for_people(value: float, digits: int | None, text: str) -> None:
     assert number(value, digits) == text
+
+
+def test_a_series_of_files_is_one_row_of_the_inputs() -> None:
+    evidence = sample_evidence()
+    many = {f"ct/IM{k:04}.dcm": f"{k:064x}" for k in range(30)} | {"ligaments.csv": "b" * 64}
+    page = html(replace(evidence, facts=replace(evidence.facts, source="ct", source_files=many)))
+    assert "ct/ (30 files, one SHA-256 over the list of all)" in page
+    assert "IM0001" not in page
+    assert "b" * 64 in page
+    assert "from a CT</h1>" in page
+    assert "found in the CT by the program" in page

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.artifacts import ANATOMY, CASE_FACTS, LABELS, MESHES, MOVING_BODY, REFERENCE_BODY, SURFACE_ORIGINS
+from pipeline.artifacts import (
+    ANATOMY,
+    CASE_FACTS,
+    LABELS,
+    MADE_MESHES,
+    MESHES,
+    MOVING_BODY,
+    REFERENCE_BODY,
+    SURFACE_ORIGINS,
+)
 from pipeline.engine.stage import Findings, Severity
 from pipeline.errors import CaseRejected
 from pipeline.geometry.mesh import TriangleMesh, check_closed, components, genus, merged, volume_mm3
+from pipeline.geometry.phantom import PHANTOM_LABELS, phantom_labels, phantom_truth
+from pipeline.geometry.phantom_spec import PhantomSpec
 from pipeline.geometry.volume import LabelVolume
 from pipeline.records import Anatomy, SurfaceOrigin
 from pipeline.stages.contact import STAGE, Params
@@ -180,3 +192,111 @@ def test_meshes_are_merged_as_they_are() -> None:
 def test_a_body_without_meshes_is_refused() -> None:
     with pytest.raises(CaseRejected, match="E-CON-01 The moving contact body has no closed surface: expected at least"):
         of_meshes({"femur": sphere(10.0, fine=1)})
+
+
+@pytest.fixture(scope="module")
+def bare_knee() -> dict[str, Any]:
+    """The bones of a coarse phantom, without cartilage and menisci, with its true frames."""
+    spec = PhantomSpec(spacing_mm=(1.0, 1.0, 1.0))
+    labels, truth = phantom_labels(spec), phantom_truth(spec)
+    values = np.zeros_like(labels.values)
+    values[labels.values == PHANTOM_LABELS["femur"]] = 1
+    values[labels.values == PHANTOM_LABELS["tibia"]] = 2
+    attitude = tuple(float(value) for value in truth.scan_attitude)
+    return {
+        CASE_FACTS.name: facts(structures={"femur": 1, "tibia": 2}),
+        LABELS.name: LabelVolume(values, labels.lps_from_index),
+        ANATOMY.name: anatomy(truth.scan_from_reference, truth.scan_from_moving, attitude),  # type: ignore[arg-type]
+        MESHES.name: {},
+    }
+
+
+KNEE = Params(
+    reference=["femur", "femoral_cartilage"],
+    moving=["tibia", "medial_tibial_cartilage", "lateral_tibial_cartilage", "medial_meniscus", "lateral_meniscus"],
+    triangles=20_000,
+)
+
+
+def meshes_of(run: Run) -> dict[str, TriangleMesh]:
+    return run[MADE_MESHES]
+
+
+def test_missing_cartilage_and_menisci_are_made_where_that_is_wanted(bare_knee: dict[str, Any]) -> None:
+    run = Run(STAGE, dict(bare_knee))
+    findings = run.go(KNEE.model_copy(update={"missing_surfaces": "make"}))
+    made = {one.structure for one in run[SURFACE_ORIGINS] if one.origin == "synthesised"}
+    assert made == set(KNEE.reference[1:] + KNEE.moving[1:])
+    assert made == set(meshes_of(run))
+    assert [one.code for one in findings] == ["N-CON-01", "N-CON-01", "N-CON-02"]
+    assert findings[-1].message.startswith("Made from the bones, not seen in the scan: femoral cartilage, ")
+    for name, mesh in run[MADE_MESHES].items():
+        check_closed(mesh, name)
+    # the bodies are the bones and what was made on them
+    assert volume_mm3(run[REFERENCE_BODY]) > volume_mm3(run[MADE_MESHES]["femoral_cartilage"]) > 3000.0
+    gap = (
+        run[MADE_MESHES]["medial_meniscus"].points[:, 2].max() - run[MADE_MESHES]["medial_meniscus"].points[:, 2].min()
+    )
+    assert 3.0 < gap < 12.0
+
+
+def test_bones_alone_stay_alone_where_that_is_wanted(bare_knee: dict[str, Any]) -> None:
+    run = Run(STAGE, dict(bare_knee))
+    findings = run.go(KNEE)
+    assert run[MADE_MESHES] == {}
+    assert {one.origin for one in run[SURFACE_ORIGINS]} == {"labelled", "absent"}
+    assert [one.code for one in findings] == ["N-CON-01", "N-CON-01", "W-CON-01"]
+
+
+def test_a_filler_stands_for_all_that_is_missing(bare_knee: dict[str, Any]) -> None:
+    run = Run(STAGE, dict(bare_knee))
+    findings = run.go(KNEE.model_copy(update={"missing_surfaces": "filler"}))
+    assert set(meshes_of(run)) == {"joint_space_filler"}
+    assert SurfaceOrigin("moving", "joint_space_filler", "synthesised") in run[SURFACE_ORIGINS]
+    assert [one.code for one in findings] == ["N-CON-01", "N-CON-01", "N-CON-02"]
+
+
+def test_a_left_knee_gets_the_mirror_image_of_a_right_one(bare_knee: dict[str, Any]) -> None:
+    right, left = Run(STAGE, dict(bare_knee)), Run(STAGE, dict(bare_knee))
+    mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
+    labels, seen = bare_knee[LABELS.name], bare_knee[ANATOMY.name]
+    turned = LabelVolume(labels.values[::-1], mirror @ _reversed(labels))
+    frames = (mirror @ np.array(seen.scan_from_reference), mirror @ np.array(seen.scan_from_moving))
+    left.given |= {
+        LABELS.name: turned,
+        CASE_FACTS.name: facts(structures={"femur": 1, "tibia": 2}, side="left"),
+        ANATOMY.name: replace(anatomy(*frames, seen.scan_attitude), side="left"),
+    }
+    params = KNEE.model_copy(update={"missing_surfaces": "make"})
+    right.go(params)
+    left.go(params)
+    for artifact in (REFERENCE_BODY, MOVING_BODY):
+        np.testing.assert_allclose(left[artifact].points * [-1.0, 1.0, 1.0], right[artifact].points, atol=1e-6)
+
+
+def _reversed(labels: LabelVolume) -> NDArray[np.float64]:
+    """The matrix of the same volume stored with its first axis the other way round."""
+    matrix = labels.lps_from_index.copy()
+    matrix[:3, 3] += matrix[:3, 0] * (labels.values.shape[0] - 1)
+    matrix[:3, 0] *= -1.0
+    return matrix
+
+
+def test_a_tibia_far_turned_in_the_scan_is_told(bare_knee: dict[str, Any]) -> None:
+    seen = bare_knee[ANATOMY.name]
+    flexion, varus, _, *shift = seen.scan_attitude
+    run = Run(STAGE, {**bare_knee, ANATOMY.name: replace(seen, scan_attitude=(flexion, varus, 30.0, *shift))})
+    findings = run.go(KNEE.model_copy(update={"missing_surfaces": "make"}))
+    (told,) = [one for one in findings if one.code == "W-CON-03"]
+    assert told.severity is Severity.REVIEW
+    assert "18 deg farther inwardly turned" in told.message
+
+
+def test_bones_that_are_no_knee_are_refused(bare_knee: dict[str, Any]) -> None:
+    seen = bare_knee[ANATOMY.name]
+    away = np.array(seen.scan_from_moving)
+    away[:3, 3] += 60.0 * away[:3, 2]
+    wrong = anatomy(np.array(seen.scan_from_reference), away, seen.scan_attitude)
+    run = Run(STAGE, {**bare_knee, ANATOMY.name: wrong})
+    with pytest.raises(CaseRejected, match="E-CON-02 Cartilage and menisci cannot be made from these bones"):
+        run.go(KNEE.model_copy(update={"missing_surfaces": "make"}))

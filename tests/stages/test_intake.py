@@ -12,14 +12,16 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from pipeline.artifacts import CASE_FACTS, GIVEN_MESHES, LABELS, LIGAMENTS
+from pipeline.artifacts import CT, GIVEN_FACTS, GIVEN_LABELS, GIVEN_MESHES, LIGAMENTS
 from pipeline.engine.artifacts import SOURCE, Artifact, SourceFolder
 from pipeline.engine.stage import Finding, Severity
 from pipeline.errors import CaseRejected
+from pipeline.files.dicom_writer import SeriesSpec, encode_series
 from pipeline.files.meshes import encode_ply, encode_stl
+from pipeline.files.nrrd_format import encode_nrrd
 from pipeline.files.strict_yaml import parse_yaml
 from pipeline.geometry.mesh import TriangleMesh
-from pipeline.geometry.volume import LabelVolume
+from pipeline.geometry.volume import CtVolume, LabelVolume
 from pipeline.records import CaseFacts, LigamentFibre
 from pipeline.stages.intake import STAGE, Params
 from tests.files.label_samples import knee_like, nifti_bytes, nrrd_bytes, restored, segment_keys
@@ -74,11 +76,11 @@ class Result:
 
     @property
     def facts(self) -> CaseFacts:
-        return self.out.decoded(CASE_FACTS)
+        return self.out.decoded(GIVEN_FACTS)
 
     @property
     def volume(self) -> LabelVolume:
-        volume = self.out.decoded(LABELS)
+        volume = self.out.decoded(GIVEN_LABELS)
         assert volume is not None
         return volume
 
@@ -150,8 +152,8 @@ def test_the_same_case_in_other_files_is_the_same_case(tmp_path: Path) -> None:
 
 def test_the_same_bytes_each_time(tmp_path: Path) -> None:
     first, second = run_on(tmp_path, knee_like()), run_on(tmp_path, knee_like())
-    assert first.out.files["labels"] == second.out.files["labels"]
-    assert first.out.files["case_facts"] == second.out.files["case_facts"]
+    assert first.out.files["given_labels"] == second.out.files["given_labels"]
+    assert first.out.files["given_facts"] == second.out.files["given_facts"]
 
 
 def test_the_side_is_never_guessed(tmp_path: Path) -> None:
@@ -316,7 +318,7 @@ def test_a_case_of_meshes(tmp_path: Path) -> None:
     (tmp_path / "meshes/screw.stl").write_bytes(b"never read")
     (tmp_path / "ligaments.csv").write_text(LIGAMENT_TABLE)
     result = Result(tmp_path, PARAMS)
-    assert result.out.decoded(LABELS) is None
+    assert result.out.decoded(GIVEN_LABELS) is None
     meshes = result.out.decoded(GIVEN_MESHES)
     assert list(meshes) == ["femur", "tibia"]
     assert [fibre.name for fibre in result.out.decoded(LIGAMENTS)] == ["ACL", "PCL"]
@@ -369,3 +371,50 @@ def test_real_knees(case: str, tmp_path: Path) -> None:
     assert result.codes(Severity.REVIEW) == []
     assert {finding.code for finding in result.findings} == {"N-FOV-01"}
     assert len(result.facts.structures) == {"knee_mr_a": 10, "knee_mr_b": 7}[case]
+
+
+def small_ct() -> CtVolume:
+    """A block of bone in soft tissue in air, 40 x 36 x 30 mm."""
+    values = np.full((40, 36, 30), -1000, dtype=np.int16)
+    values[6:34, 6:30, :] = 40
+    values[14:26, 12:24, 2:28] = 900
+    return CtVolume(values, np.diag([1.0, 1.0, 1.0, 1.0]))
+
+
+def test_a_dicom_series_without_labels_becomes_a_ct(tmp_path: Path) -> None:
+    (tmp_path / "ct").mkdir()
+    for name, data in encode_series(small_ct()).items():
+        (tmp_path / "ct" / name).write_bytes(data)
+    (tmp_path / "ct" / "Thumbs.db").write_bytes(b"not a slice")
+    result = Result(tmp_path, PARAMS)
+    assert result.facts.source == "ct"
+    assert result.facts.structures == {}
+    ct = result.out.decoded(CT)
+    assert ct is not None
+    np.testing.assert_array_equal(ct.values, small_ct().values)
+    assert result.out.decoded(GIVEN_LABELS) is None
+    (told,) = [finding for finding in result.findings if finding.code == "N-DCM-01"]
+    assert "Thumbs.db" in told.message
+
+
+def test_a_ct_beside_labels_is_kept_for_comparison(tmp_path: Path) -> None:
+    (tmp_path / "ct.nrrd").write_bytes(encode_nrrd(small_ct()))
+    result = run_on(tmp_path, knee_like())
+    assert result.facts.source == "labels"
+    assert result.out.decoded(CT) is not None
+
+
+def test_a_ct_that_names_the_other_side_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "ct").mkdir()
+    for name, data in encode_series(small_ct(), SeriesSpec(laterality="L")).items():
+        (tmp_path / "ct" / name).write_bytes(data)
+    with pytest.raises(CaseRejected, match="E-SIDE-03 The case is declared right, and every slice of the CT says left"):
+        Result(tmp_path, PARAMS)
+
+
+def test_two_cts_are_too_many(tmp_path: Path) -> None:
+    (tmp_path / "ct").mkdir()
+    (tmp_path / "ct" / "1.dcm").write_bytes(b"x")
+    (tmp_path / "ct.nrrd").write_bytes(encode_nrrd(small_ct()))
+    with pytest.raises(CaseRejected, match="E-IO-16 The case folder holds more than one CT"):
+        Result(tmp_path, PARAMS)

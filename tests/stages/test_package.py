@@ -166,7 +166,7 @@ def test_the_manifest_names_every_file_by_its_hash(files: dict[str, bytes]) -> N
         assert entry == {"sha256": hashlib.sha256(files[name]).hexdigest(), "bytes": len(files[name])}
     assert manifest["verdict"] == {"word": "REVIEW", "reasons": ["Only 63 mm of tibia in the scan."]}
     assert manifest["settings"]["sweep"] == {"flexion_step_deg": 5.0}
-    assert set(manifest["settings"]) == {"intake", "mesh", "anatomy", "contact", "sweep", "smooth", "qa"}
+    assert set(manifest["settings"]) == {"intake", "segment", "mesh", "anatomy", "contact", "sweep", "smooth", "qa"}
     assert manifest["findings"] == [
         {"stage": "intake", "code": "W-FOV-01", "severity": "review", "message": "Only 63 mm of tibia in the scan."}
     ]

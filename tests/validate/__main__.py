@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tests.validate import Measurement, Row
+from tests.validate.from_ct import ROWS as FROM_CT
 from tests.validate.knees import ROWS as KNEES
 from tests.validate.measured_motion import ROWS as MOTION
 from tests.validate.mesh_and_mirror import ROWS as MESH_AND_MIRROR
@@ -15,7 +16,7 @@ from tests.validate.neutral_motion import ROWS as NEUTRAL
 from tests.validate.paper_objects import ROWS as PAPER_OBJECTS
 
 REPORT = Path("build/validate.json")
-ROWS: tuple[Measurement, ...] = (*PAPER_OBJECTS, *KNEES, *MESH_AND_MIRROR, *MOTION, *NEUTRAL)
+ROWS: tuple[Measurement, ...] = (*PAPER_OBJECTS, *KNEES, *MESH_AND_MIRROR, *MOTION, *NEUTRAL, *FROM_CT)
 
 
 def line(row: Row) -> str:

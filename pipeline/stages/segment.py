@@ -1,0 +1,131 @@
+"""Stage 20, segment: the labels of the bones, as given or found in the CT; given ones are held against the CT."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.adapters.bone_segmentation import BoneSegmentation, SegmentationSettings, segment_bones
+from pipeline.artifacts import CASE_FACTS, CT, GIVEN_FACTS, GIVEN_LABELS, LABELS
+from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage, StrictParams
+from pipeline.errors import CaseRejected
+from pipeline.geometry.label_fit import BoneFit, bone_fit
+from pipeline.geometry.volume import CtVolume, LabelVolume, border_areas_mm2
+from pipeline.records import CaseFacts
+
+
+class Params(StrictParams):
+    """How bones are found in a CT, and what makes them doubtful."""
+
+    smoothing_mm: float = Field(0.3, ge=0, le=3, description="standard deviation of a Gaussian on the CT")
+    closing_mm: float = Field(
+        1.5, ge=0, le=5, description="gaps in the shell of a bone up to about twice this are closed"
+    )
+    reach_mm: float = Field(160.0, ge=40, le=600, description="how far from the joint bones are followed, up and down")
+    min_confidence_fraction: float = Field(0.8, ge=0, le=1, description="a bone found less surely needs review")
+    least_contrast_hu: float = Field(
+        100.0, ge=0, le=2000, description="given labels of bone are this much denser than what lies around them"
+    )
+
+    def settings(self) -> SegmentationSettings:
+        """As the method takes them."""
+        return SegmentationSettings(self.smoothing_mm, self.closing_mm, self.reach_mm)
+
+
+def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
+    """Find the bones, or see that given labels are those of this CT.
+
+    Raises
+    ------
+    CaseRejected
+        E-SEG-01 when there is no such knee in the CT, E-LBL-06 when labels do not belong to it.
+    """
+    facts, labels, ct = reads[GIVEN_FACTS], reads[GIVEN_LABELS], reads[CT]
+    if facts.source != "ct":
+        out[CASE_FACTS], out[LABELS] = facts, labels
+        return () if ct is None or labels is None else _fitting(ct, labels, facts, params)
+    if ct is None:
+        raise ValueError("a case of a CT has no CT")
+    try:
+        found = segment_bones(ct, facts.side, params.settings())
+    except ValueError as error:
+        raise _not_found(error) from error
+    out[CASE_FACTS], out[LABELS] = _facts_of(facts, found), found.labels
+    return _findings(found, params)
+
+
+def _not_found(error: ValueError) -> CaseRejected:
+    return CaseRejected(
+        "E-SEG-01",
+        f"The bones cannot be found: {error}.",
+        "Check that this is the CT of the knee, and the side; else segment the bones and give a label map.",
+    )
+
+
+def _facts_of(facts: CaseFacts, found: BoneSegmentation) -> CaseFacts:
+    labels = found.labels
+    x, y, z = map(float, labels.spacing_mm)
+    i, j, k = labels.values.shape
+    clipped = {
+        name: float(border_areas_mm2(np.asarray(labels.values) == value, labels.spacing_mm).sum())
+        for name, value in found.structures.items()
+    }
+    return replace(
+        facts,
+        structures=dict(found.structures),
+        voxels={name: bone.voxels for name, bone in found.bones.items()},
+        spacing_mm=(x, y, z),
+        shape=(i, j, k),
+        clipped_mm2=clipped,
+    )
+
+
+def _findings(found: BoneSegmentation, params: Params) -> Findings:
+    sure = ", ".join(f"{name} {100 * value:.0f} %" for name, value in found.confidence.items())
+    out = [Finding("N-SEG-01", Severity.NOTE, f"The bones were found in the CT by the program; how surely: {sure}.")]
+    if doubtful := [name for name, value in found.confidence.items() if value < params.min_confidence_fraction]:
+        message = f"Found without certainty in the CT: {', '.join(doubtful)}. Look at their outlines on the slices."
+        out.append(Finding("W-SEG-01", Severity.REVIEW, message))
+    if found.facts.missing:
+        message = f"Not found in the CT: {', '.join(found.facts.missing)}. They take no part in the contact."
+        out.append(Finding("N-SEG-02", Severity.NOTE, message))
+    if found.facts.knees > 1:
+        message = f"{found.facts.knees} knees are in the CT; the one of the declared side was taken."
+        out.append(Finding("N-SEG-03", Severity.NOTE, message))
+    if found.facts.metal_mm3 > 0.0:
+        message = f"There is metal in the CT ({found.facts.metal_mm3 / 1000:.1f} ml): outlines near it are not sure."
+        out.append(Finding("W-SEG-02", Severity.REVIEW, message))
+    return tuple(out)
+
+
+def _fitting(ct: CtVolume, labels: LabelVolume, facts: CaseFacts, params: Params) -> Findings:
+    """Whether labels of bone lie on bone."""
+    fits: dict[str, BoneFit] = {
+        name: bone_fit(ct, labels, facts.structures[name]) for name in ("femur", "tibia") if name in facts.structures
+    }
+    if bad := {name: fit for name, fit in fits.items() if not _fits(fit, params)}:
+        raise CaseRejected(
+            "E-LBL-06",
+            f"The label map does not belong to this CT: {_words(bad)}.",
+            "Check that labels and CT are of the same patient, study and series.",
+        )
+    message = f"The labels lie on bone in the CT: {_words(fits)}."
+    return (Finding("N-LBL-06", Severity.NOTE, message),)
+
+
+def _fits(fit: BoneFit, params: Params) -> bool:
+    return fit.covered > 0.99 and fit.inside_hu - fit.outside_hu >= params.least_contrast_hu
+
+
+def _words(fits: Mapping[str, BoneFit]) -> str:
+    return "; ".join(
+        f"{name} at its edge {fit.inside_hu:.0f} HU, around it {fit.outside_hu:.0f} HU"
+        + (f", {100 * (1 - fit.covered):.0f} % of it outside the CT" if fit.covered < 0.995 else "")
+        for name, fit in fits.items()
+    )
+
+
+STAGE = Stage(20, "segment", (GIVEN_FACTS, GIVEN_LABELS, CT), (CASE_FACTS, LABELS), Params, run)
