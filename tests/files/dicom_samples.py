@@ -8,14 +8,16 @@ import zlib
 from collections.abc import Mapping
 
 import numpy as np
+import pytest
 from pydicom import DataElement, Dataset, dcmread, dcmwrite
 from pydicom.datadict import dictionary_VR, tag_for_keyword
 from pydicom.dataelem import RawDataElement
 from pydicom.tag import Tag
 from pydicom.uid import UID
 
+from pipeline.errors import CaseRejected
 from pipeline.files.ct_volumes import CtScan
-from pipeline.files.dicom_headers import DEFLATED, silent_pydicom
+from pipeline.files.dicom_headers import DEFLATED, DicomHeader, read_header, silent_pydicom
 from pipeline.files.dicom_series import read_dicom_series
 from pipeline.files.dicom_writer import SeriesSpec, encode_series
 from pipeline.geometry.volume import CtVolume
@@ -182,3 +184,30 @@ def deflated(data: bytes, surplus: int = 0) -> bytes:
     body = machine.compress(bytes(surplus)) + machine.flush()
     meta_length = 132 + 12 + struct.unpack_from("<I", out, 140)[0]
     return out[:meta_length] + body
+
+
+def refused(code: str, problem: str = "") -> pytest.RaisesExc[CaseRejected]:
+    """Expects a refusal of this code, its problem or action holding a pattern."""
+    return pytest.raises(CaseRejected, match=f"(?s)^{code} .*{problem}")
+
+
+def assert_same(found: CtScan, expected: CtVolume) -> None:
+    """The same voxels in the same place."""
+    np.testing.assert_array_equal(found.volume.values, expected.values)
+    np.testing.assert_allclose(found.volume.lps_from_index, expected.lps_from_index, atol=1e-6)
+
+
+def codes(found: CtScan) -> list[str]:
+    """Of the findings, in order."""
+    return [finding.code for finding in found.findings]
+
+
+def without(files: Files, *names: str) -> Files:
+    """A series with files left out."""
+    return {name: data for name, data in files.items() if name not in names}
+
+
+def headers_of(files: Files) -> list[DicomHeader]:
+    """The headers of those that can be read."""
+    found = [read_header(data, name) for name, data in files.items()]
+    return [header for header in found if isinstance(header, DicomHeader)]

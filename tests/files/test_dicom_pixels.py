@@ -11,15 +11,16 @@ from pydicom import dcmread
 from pydicom.uid import JPEGLSNearLossless
 
 from pipeline.errors import CaseRejected
-from pipeline.files.ct_volumes import CtScan
-from pipeline.files.dicom_headers import DicomHeader, read_header
 from pipeline.files.dicom_pixels import stored_pixels
 from pipeline.files.dicom_writer import SeriesSpec, encode_series
 from pipeline.geometry.volume import CtVolume
 from tests.files.dicom_samples import (
-    Files,
+    assert_same,
+    codes,
+    headers_of,
     leg,
     read,
+    refused,
     series,
     short,
     with_edited,
@@ -29,24 +30,6 @@ from tests.files.dicom_samples import (
 LEG = leg()
 FILES = series()
 MIDDLE, LAST = "IM0006.dcm", "IM0012.dcm"
-
-
-def refused(code: str, problem: str = "") -> pytest.RaisesExc[CaseRejected]:
-    return pytest.raises(CaseRejected, match=f"(?s)^{code} .*{problem}")
-
-
-def assert_same(found: CtScan, expected: CtVolume) -> None:
-    np.testing.assert_array_equal(found.volume.values, expected.values)
-    np.testing.assert_allclose(found.volume.lps_from_index, expected.lps_from_index, atol=1e-6)
-
-
-def codes(found: CtScan) -> list[str]:
-    return [finding.code for finding in found.findings]
-
-
-def headers_of(files: Files) -> list[DicomHeader]:
-    found = [read_header(data, name) for name, data in files.items()]
-    return [header for header in found if isinstance(header, DicomHeader)]
 
 
 def test_padding_becomes_air() -> None:  # D15

@@ -11,8 +11,6 @@ import pytest
 
 from pipeline.errors import CaseRejected
 from pipeline.files import dicom_series
-from pipeline.files.ct_volumes import CtScan
-from pipeline.files.dicom_headers import DicomHeader, read_header
 from pipeline.files.dicom_series import MAX_FILES, choose_series, read_dicom_series
 from pipeline.files.dicom_writer import TRANSFER_SYNTAXES, SeriesSpec, encode_series
 from pipeline.geometry.volume import CtVolume
@@ -21,18 +19,23 @@ from tests.files.dicom_samples import (
     SECONDARY_CAPTURE,
     STRUCTURED_REPORT,
     Files,
+    assert_same,
+    codes,
     deflated,
     ds,
     edited,
     enhanced,
+    headers_of,
     leg,
     other_object,
     read,
+    refused,
     scout,
     series,
     short,
     turned,
     with_edited,
+    without,
 )
 
 FOOT = Path(__file__).resolve().parents[3] / "shared/data/foot_ct/dicom"
@@ -41,28 +44,6 @@ needs_foot = pytest.mark.skipif(not FOOT.is_dir(), reason="the foot CT was not f
 LEG = leg()
 FILES = series()
 MIDDLE, LAST = "IM0006.dcm", "IM0012.dcm"
-
-
-def refused(code: str, problem: str = "") -> pytest.RaisesExc[CaseRejected]:
-    return pytest.raises(CaseRejected, match=f"(?s)^{code} .*{problem}")
-
-
-def assert_same(found: CtScan, expected: CtVolume) -> None:
-    np.testing.assert_array_equal(found.volume.values, expected.values)
-    np.testing.assert_allclose(found.volume.lps_from_index, expected.lps_from_index, atol=1e-6)
-
-
-def codes(found: CtScan) -> list[str]:
-    return [finding.code for finding in found.findings]
-
-
-def without(*names: str) -> Files:
-    return {name: data for name, data in FILES.items() if name not in names}
-
-
-def headers_of(files: Files) -> list[DicomHeader]:
-    found = [read_header(data, name) for name, data in files.items()]
-    return [header for header in found if isinstance(header, DicomHeader)]
 
 
 # what is accepted
@@ -299,7 +280,7 @@ def test_cut_anywhere(syntax: str, name: str) -> None:  # D18: the last slice to
 def test_no_dicom_where_a_slice_should_be(data: bytes) -> None:  # D18
     for name in (LAST, "IM0012", "12.IMA"):
         with refused("E-IO-11", f"{name} is damaged or no DICOM file"):
-            read({**without(LAST), name: data})
+            read({**without(FILES, LAST), name: data})
 
 
 def test_flipped_bits_of_one_header() -> None:  # D20

@@ -7,54 +7,33 @@ import re
 import numpy as np
 import pytest
 
-from pipeline.errors import CaseRejected
-from pipeline.files.ct_volumes import CtScan
-from pipeline.files.dicom_headers import DicomHeader, read_header
 from pipeline.files.dicom_series import choose_series
 from pipeline.files.dicom_stack import check_stack
 from pipeline.files.dicom_writer import encode_series
 from pipeline.geometry.volume import CtVolume
 from tests.files import dicom_samples
 from tests.files.dicom_samples import (
-    Files,
+    assert_same,
     at_heights,
+    codes,
     ds,
     edited,
+    headers_of,
     height,
     leg,
     read,
+    refused,
     series,
     short,
     tilted,
     with_edited,
     with_positions,
+    without,
 )
 
 LEG = leg()
 FILES = series()
 MIDDLE, LAST = "IM0006.dcm", "IM0012.dcm"
-
-
-def refused(code: str, problem: str = "") -> pytest.RaisesExc[CaseRejected]:
-    return pytest.raises(CaseRejected, match=f"(?s)^{code} .*{problem}")
-
-
-def assert_same(found: CtScan, expected: CtVolume) -> None:
-    np.testing.assert_array_equal(found.volume.values, expected.values)
-    np.testing.assert_allclose(found.volume.lps_from_index, expected.lps_from_index, atol=1e-6)
-
-
-def codes(found: CtScan) -> list[str]:
-    return [finding.code for finding in found.findings]
-
-
-def without(*names: str) -> Files:
-    return {name: data for name, data in FILES.items() if name not in names}
-
-
-def headers_of(files: Files) -> list[DicomHeader]:
-    found = [read_header(data, name) for name, data in files.items()]
-    return [header for header in found if isinstance(header, DicomHeader)]
 
 
 @pytest.mark.parametrize(
@@ -68,7 +47,7 @@ def headers_of(files: Files) -> list[DicomHeader]:
 def test_missing_slices_are_placed(lost: tuple[str, ...], neighbours: tuple[int, int]) -> None:  # D01
     places = [re.escape(f"{height(f'IM{n:04d}'):g}) mm") for n in neighbours]
     with refused("E-DCM-09", f"{len(lost)} slices are missing .*{places[0]}.*{places[1]}"):
-        read(without(*lost))
+        read(without(FILES, *lost))
 
 
 def test_the_same_place_twice() -> None:  # D04
