@@ -76,7 +76,7 @@ def charts_png(heading: str, footer: str, charts: Sequence[Chart], columns: int 
             _draw(figure.add_subplot(rows, columns, number), chart)
         entries = [axes.get_legend_handles_labels() for axes in figure.axes]
         handles = {label: handle for found in entries for handle, label in zip(*found, strict=True)}
-        figure.legend(handles.values(), handles.keys(), loc="outside lower left", ncols=7, frameon=False)
+        figure.legend(handles.values(), handles.keys(), loc="outside lower left", ncols=5, frameon=False)
         figure.supxlabel(footer, x=0.99, ha="right", fontsize=10, fontweight="bold", color="#6e6e6e")
         data = io.BytesIO()
         # what savefig does, but for laying the charts out and drawing them twice

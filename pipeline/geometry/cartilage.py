@@ -22,6 +22,8 @@ Float = NDArray[np.float64]
 CELL_MM = 0.5
 #: Where the femoral patch ends, degrees about the flexion axis from distal: anterior (trochlea) and posterior.
 TROCHLEA_DEG, POSTERIOR_DEG = -95.0, 140.0
+#: Pieces of a femoral patch smaller than this share of the largest are no cartilage.
+LEAST_PIECE = 0.2
 #: Fields are blurred by this before slopes are taken (mm).
 BLUR_MM = 1.0
 #: Bones farther apart than this are not those of a joint at rest (mm).
@@ -115,8 +117,18 @@ def _femoral_patch(raster: Raster, relative: Float, facing: Float) -> Float:
     angle = raster.axes()[1][None, :]
     ends = eased(angle, TROCHLEA_DEG, TROCHLEA_DEG + 12.0) * eased(-angle, -POSTERIOR_DEG, 12.0 - POSTERIOR_DEG)
     shaft = np.where(angle > 80.0, eased(-relative, -1.3, -1.2), eased(-relative, -1.75, -1.65))
-    patch = eased(facing, 0.45, 0.65) * ends * eased(relative, 0.78, 0.88) * shaft
-    return np.asarray(np.nan_to_num(patch))
+    patch = np.nan_to_num(eased(facing, 0.45, 0.65) * ends * eased(relative, 0.78, 0.88) * shaft)
+    return _without_islands(patch)
+
+
+def _without_islands(patch: Float) -> Float:
+    """The patch without pieces below a fifth of its largest one: an epicondyle may face away from the axis too."""
+    from scipy import ndimage  # noqa: PLC0415 - half a second that a run of cached stages need not pay
+
+    pieces, count = ndimage.label(patch > 0.0)
+    sizes = ndimage.sum_labels(patch, pieces, np.arange(1, count + 1))
+    keep = np.concatenate([[False], sizes >= LEAST_PIECE * sizes.max(initial=0.0)])
+    return np.where(keep[pieces], patch, 0.0)
 
 
 def plateau_surface(tibia: TriangleMesh) -> PlateauSurface:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.adapters.mask_surface import SurfaceSettings, mask_to_mesh
+from pipeline.geometry.cartilage import radial_surface
 from pipeline.geometry.containment import contains
 from pipeline.geometry.made_surfaces import (
     FILLER,
@@ -16,9 +17,10 @@ from pipeline.geometry.made_surfaces import (
     anatomical_surfaces,
     joint_space_filler,
 )
-from pipeline.geometry.mesh import Float, TriangleMesh, transformed
+from pipeline.geometry.mesh import Float, TriangleMesh, merged, transformed
 from pipeline.geometry.phantom import PHANTOM_LABELS, phantom_labels, phantom_truth
 from pipeline.geometry.phantom_spec import PhantomSpec
+from pipeline.geometry.validation_objects import ball
 from pipeline.kinematics.body_frames import in_frame
 
 SPEC = PhantomSpec(spacing_mm=(1.0, 1.0, 1.0))
@@ -72,6 +74,16 @@ def test_femoral_cartilage_is_as_thick_as_said_around_the_condyles(made: MadeSur
             near = (np.abs(outside[:, 0] - side * 0.5 * SPEC.condyle_spacing_mm) < 3.0) & (np.abs(around - angle) < 4.0)
             radius = np.hypot(outside[near, 1], outside[near, 2])
             assert np.ptp(radius) == pytest.approx(made.spaces[name].femoral_mm, abs=0.9)
+
+
+def test_a_bump_beside_the_joint_gets_no_cartilage(bones: KneeBones) -> None:
+    """An epicondyle that faces away from the flexion axis is an island of the patch, and no part of it."""
+    bump = TriangleMesh(ball(6.0).points + np.array([46.0, 24.0, 4.0]), ball(6.0).triangles)
+    radial = radial_surface(merged([bones.femur, bump]))
+    there = radial.raster.axes()[0] > 42.0
+    assert np.isfinite(radial.radius_mm[there]).sum() > 100
+    np.testing.assert_array_equal(radial.patch[there], 0.0)
+    assert (radial.patch > 0.9).sum() > 5000
 
 
 def test_nothing_is_made_inside_the_femur_of_the_scan(made: MadeSurfaces, bones: KneeBones) -> None:
