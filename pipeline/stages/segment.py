@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
 
-from pipeline.adapters.bone_segmentation import BoneSegmentation, SegmentationSettings, segment_bones
 from pipeline.artifacts import CASE_FACTS, CT, GIVEN_FACTS, GIVEN_LABELS, LABELS
 from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage, StrictParams
 from pipeline.errors import CaseRejected
 from pipeline.geometry.label_fit import BoneFit, bone_fit
 from pipeline.geometry.volume import CtVolume, LabelVolume, border_areas_mm2
 from pipeline.records import CaseFacts
+
+if TYPE_CHECKING:
+    from pipeline.adapters.bone_segmentation import BoneSegmentation
 
 
 class Params(StrictParams):
@@ -29,10 +32,6 @@ class Params(StrictParams):
     least_contrast_hu: float = Field(
         100.0, ge=0, le=2000, description="given labels of bone are this much denser than what lies around them"
     )
-
-    def settings(self) -> SegmentationSettings:
-        """As the method takes them."""
-        return SegmentationSettings(self.smoothing_mm, self.closing_mm, self.reach_mm)
 
 
 def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
@@ -49,20 +48,23 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
         return () if ct is None or labels is None else _fitting(ct, labels, facts, params)
     if ct is None:
         raise ValueError("a case of a CT has no CT")
-    try:
-        found = segment_bones(ct, facts.side, params.settings())
-    except ValueError as error:
-        raise _not_found(error) from error
+    found = _found(ct, facts, params)
     out[CASE_FACTS], out[LABELS] = _facts_of(facts, found), found.labels
     return _findings(found, params)
 
 
-def _not_found(error: ValueError) -> CaseRejected:
-    return CaseRejected(
-        "E-SEG-01",
-        f"The bones cannot be found: {error}.",
-        "Check that this is the CT of the knee, and the side; else segment the bones and give a label map.",
-    )
+def _found(ct: CtVolume, facts: CaseFacts, params: Params) -> BoneSegmentation:
+    from pipeline.adapters import bone_segmentation  # noqa: PLC0415 - scipy, which a cached run must not pay for
+
+    settings = bone_segmentation.SegmentationSettings(params.smoothing_mm, params.closing_mm, params.reach_mm)
+    try:
+        return bone_segmentation.segment_bones(ct, facts.side, settings)
+    except ValueError as error:
+        raise CaseRejected(
+            "E-SEG-01",
+            f"The bones cannot be found: {error}.",
+            "Check that this is the CT of the knee, and the side; else segment the bones and give a label map.",
+        ) from error
 
 
 def _facts_of(facts: CaseFacts, found: BoneSegmentation) -> CaseFacts:

@@ -56,7 +56,7 @@ def test_doubt_metal_another_knee_and_what_is_missing_are_told(ct: CtVolume, mon
         confidence={**found.confidence, "tibia": 0.79},
         facts=replace(found.facts, knees=2, metal_mm3=1500.0, missing=("fibula",)),
     )
-    monkeypatch.setattr("pipeline.stages.segment.segment_bones", lambda *_: told)
+    monkeypatch.setattr("pipeline.adapters.bone_segmentation.segment_bones", lambda *_: told)
     _, findings = segment({GIVEN_FACTS.name: facts(source="ct", structures={}), CT.name: ct})
     said = {one.code: one for one in findings}
     assert said["W-SEG-01"].message.startswith("Found without certainty in the CT: tibia.")
