@@ -30,7 +30,7 @@ from pipeline.geometry.bone_parts import (
     widened,
     worn,
 )
-from pipeline.geometry.volume import CtVolume, LabelVolume, Mask, box_of, in_lps_order
+from pipeline.geometry.volume import CtVolume, LabelVolume, Mask, border_areas_mm2, box_of, in_lps_order
 from pipeline.geometry.voxel_mask import shifted_index
 from pipeline.records import Side
 
@@ -199,8 +199,8 @@ def segment_bones(ct: CtVolume, side: Side, settings: SegmentationSettings | Non
 
     Notes
     -----
-    The boundary of bone lies half-way between soft tissue and the densest bone within 2 mm, so that blur does not
-    move it (a shell thinner than the blur still seems up to a quarter of a voxel too thick). Bones that touch are worn
+    The boundary of bone lies six tenths of the way from soft tissue to the densest bone within 2 mm: at half, a shell
+    thinner than the blur would seem too thick. Bones that touch are worn
     down until they come apart; from what is left, a watershed grows back along the densest paths.
     """
     settings = settings or SegmentationSettings()
@@ -291,16 +291,11 @@ def _facts(scene: _Scene, mask: Mask, value: int) -> BoneFacts:
     box = widened(box_of(mask), 4, mask.shape)
     spacing, part = scene.spacing_mm(), mask[box]
     voxels = int(np.count_nonzero(mask))
-    areas = [
-        np.prod(np.delete(spacing, axis)) * np.count_nonzero(mask.take(end, axis))
-        for axis in range(3)
-        for end in (0, -1)
-    ]
     shell = np.count_nonzero(filled((scene.owner[box] == value) & scene.hard[box] & part, 0.0, spacing) & part)
     return BoneFacts(
         voxels=voxels,
         volume_mm3=voxels * float(np.prod(spacing)),
-        cut_mm2=float(sum(areas)),
+        cut_mm2=float(border_areas_mm2(mask, spacing).sum()),
         edge_fraction=_edge_fraction(scene.values[box], part, spacing),
         shell_fraction=shell / voxels,
         parted_voxels=int(np.count_nonzero(scene.parted & mask)),

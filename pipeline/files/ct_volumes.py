@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from pipeline.engine.stage import Finding, Severity
 from pipeline.errors import CaseRejected
-from pipeline.files.foreign_image import ForeignImage, gunzip, gunzip_head, unsupported
+from pipeline.files.foreign_image import ForeignImage, gunzip, gunzip_head
 from pipeline.files.metaimage_format import read_metaimage
 from pipeline.files.nrrd_format import read_nrrd
-from pipeline.files.volumes import DETACHED_ENDINGS, check_geometry
-from pipeline.geometry.volume import CtVolume, axis_codes, in_lps_order
+from pipeline.files.volumes import check_geometry, handedness, reader_of
+from pipeline.geometry.volume import CtVolume, in_lps_order
 
 #: CT numbers that scanners write: below air some mark the rim of the scan, above 3071 an extended scale.
 HU_RANGE = (-3100.0, 32_767.0)
@@ -130,14 +130,14 @@ def read_ct_volume(data: bytes, file: str) -> CtScan:
     CaseRejected
         E-IO-*, E-GEO-*, E-CT-*; see ``docs/messages.md``.
     """
-    reader = _reader(file)
+    reader = reader_of(file, _READERS)
     try:
         image, scale = reader(data, file)
         check_geometry(image.lps_from_index, image.values.shape, file)
     except CaseRejected as error:
         raise _told_of_a_ct(error, file) from error
     values, notes = hounsfield(image.values, scale, file)
-    findings = (*image.findings, *_handedness(image, file), *notes, *check_hounsfield(values, file))
+    findings = (*image.findings, *handedness(image, file), *notes, *check_hounsfield(values, file))
     return CtScan(in_lps_order(CtVolume(values, image.lps_from_index)), findings)
 
 
@@ -233,16 +233,6 @@ def _bright(values: NDArray[np.int16], file: str) -> tuple[Finding, ...]:
     return (Finding("N-CT-02", Severity.NOTE, text),)
 
 
-def _reader(file: str) -> Callable[[bytes, str], tuple[ForeignImage, tuple[float, float]]]:
-    name = file.lower()
-    if name.endswith(DETACHED_ENDINGS):
-        raise unsupported(file, "its voxels are in another file")
-    for ending, reader in _READERS.items():
-        if name.endswith(ending):
-            return reader
-    raise unsupported(file, f"expected a file that ends in {', '.join(CT_ENDINGS)}")
-
-
 def _told_of_a_ct(error: CaseRejected, file: str) -> CaseRejected:
     """The refusal of a reader that was written for label maps, in words for a CT."""
     if error.code == "E-LBL-04":
@@ -252,16 +242,6 @@ def _told_of_a_ct(error: CaseRejected, file: str) -> CaseRejected:
     if error.code == "E-IO-14":
         return CaseRejected(error.code, error.problem, "Crop the CT to the joint and save it with 16 bits.")
     return CaseRejected(error.code, error.problem, _EXPORT)
-
-
-def _handedness(image: ForeignImage, file: str) -> tuple[Finding, ...]:
-    if np.linalg.det(image.lps_from_index[:3, :3]) > 0:
-        return ()
-    text = (
-        f"{file} stores its axes left-handed ({axis_codes(image.lps_from_index)}); one axis was reversed together "
-        "with its voxels, so that nothing is mirrored."
-    )
-    return (Finding("N-GEO-01", Severity.NOTE, text),)
 
 
 def _read_scaled_nifti(data: bytes, file: str) -> tuple[ForeignImage, tuple[float, float]]:

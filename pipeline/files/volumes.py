@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from pipeline.files.foreign_image import ForeignImage, not_finite, unsupported
 from pipeline.files.metaimage_format import read_metaimage
 from pipeline.files.nrrd_format import read_nrrd
 from pipeline.geometry.volume import LabelVolume, axis_codes, in_lps_order, label_counts, shear
+
+#: What reads the bytes of a file of some name.
+Reader = TypeVar("Reader", bound=Callable[[bytes, str], Any])
 
 #: Largest |cosine| between axes that is rounding of a header, not shear.
 MAX_SHEAR = 1e-4
@@ -88,13 +91,13 @@ def read_label_map(data: bytes, file: str) -> LabelMap:
     CaseRejected
         E-IO-*, E-GEO-*, E-LBL-02, E-LBL-04, E-LBL-05; see ``docs/messages.md``.
     """
-    image = _reader(file)(data, file)
+    image = reader_of(file, _READERS)(data, file)
     check_geometry(image.lps_from_index, image.values.shape, file)
     values, notes = label_values(image.values, file)
     if (found := int(np.count_nonzero(counts := label_counts(values)))) > MAX_LABELS:
         raise _not_labels(file, f"it has {found} different values, expected at most {MAX_LABELS}")
     volume = in_lps_order(LabelVolume(values, image.lps_from_index))
-    return LabelMap(volume, image.segments, counts, (*image.findings, *_handedness(image, file), *notes))
+    return LabelMap(volume, image.segments, counts, (*image.findings, *handedness(image, file), *notes))
 
 
 def check_geometry(lps_from_index: NDArray[np.float64], shape: tuple[int, ...], file: str) -> None:
@@ -142,17 +145,25 @@ def label_values(values: NDArray[Any], file: str) -> tuple[NDArray[np.uint16], t
     return labels, ()
 
 
-def _reader(file: str) -> Callable[[bytes, str], ForeignImage]:
+def reader_of(file: str, readers: Mapping[str, Reader]) -> Reader:
+    """The reader of a file by its ending.
+
+    Raises
+    ------
+    CaseRejected
+        E-IO-12 for an ending that none reads, and for a header whose voxels lie in another file.
+    """
     name = file.lower()
     if name.endswith(DETACHED_ENDINGS):
         raise unsupported(file, "its voxels are in another file")
-    for ending, reader in _READERS.items():
+    for ending, reader in readers.items():
         if name.endswith(ending):
             return reader
-    raise unsupported(file, f"expected a file that ends in {', '.join(LABEL_MAP_ENDINGS)}")
+    raise unsupported(file, f"expected a file that ends in {', '.join(readers)}")
 
 
-def _handedness(image: ForeignImage, file: str) -> tuple[Finding, ...]:
+def handedness(image: ForeignImage, file: str) -> tuple[Finding, ...]:
+    """A note where the axes of a file are left-handed."""
     if np.linalg.det(image.lps_from_index[:3, :3]) > 0:
         return ()
     text = (

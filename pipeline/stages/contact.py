@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal, NamedTuple
+from dataclasses import asdict
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -28,6 +29,9 @@ from pipeline.geometry.voxel_mask import part_with, seen_as_right, voxels_of
 from pipeline.missing_surfaces import NOTHING_MADE, Made, Missing, Request, filled_in, make_surfaces
 from pipeline.records import Anatomy, CaseFacts, SurfaceOrigin
 
+#: Bounds of what is made, beside the maths that keeps them.
+BOUNDS = SurfaceBounds()
+
 
 class MeniscusParams(StrictParams):
     """Bounds of one made meniscus."""
@@ -46,34 +50,28 @@ class MeniscusParams(StrictParams):
 class MadeParams(StrictParams):
     """Bounds of cartilage and menisci that are made from the bones."""
 
-    least_cartilage_mm: float = Field(0.8, gt=0, le=10, description="thickness of one side, at least")
-    most_cartilage_mm: float = Field(3.0, gt=0, le=10, description="thickness of the femoral side, at most")
-    cartilage_mm: float = Field(2.0, gt=0, le=10, description="thickness where the bones of the scan do not tell")
-    thicker_mm: float = Field(
-        1.0, ge=0, le=10, description="tibial cartilage beyond its thickness where the bones are nearest"
+    least_cartilage_mm: float = Field(
+        BOUNDS.thickness_mm[0], gt=0, le=10, description="thickness of one side, at least"
     )
-    clearance_mm: float = Field(0.15, ge=0, le=2, description="left between made surfaces at the scan pose")
-    filler_mm: float = Field(8.0, gt=0, le=30, description="height of the filler, at most")
+    most_cartilage_mm: float = Field(
+        BOUNDS.thickness_mm[1], gt=0, le=10, description="thickness of the femoral side, at most"
+    )
+    cartilage_mm: float = Field(
+        BOUNDS.default_thickness_mm, gt=0, le=10, description="thickness where the bones of the scan do not tell"
+    )
+    thicker_mm: float = Field(
+        BOUNDS.extra_mm, ge=0, le=10, description="tibial cartilage beyond its thickness where the bones are nearest"
+    )
+    clearance_mm: float = Field(
+        BOUNDS.clearance_mm, ge=0, le=2, description="left between made surfaces at the scan pose"
+    )
+    filler_mm: float = Field(BOUNDS.filler_mm, gt=0, le=30, description="height of the filler, at most")
     triangle_mm2: float = Field(0.7, ge=0.05, le=10, description="area of a triangle of what is made, on average")
     medial_meniscus: MeniscusParams = Field(
-        default=MeniscusParams(
-            height_mm=6.5,
-            anterior_width_mm=8.0,
-            posterior_width_mm=11.0,
-            anterior_inset_mm=1.0,
-            posterior_inset_mm=3.0,
-        ),
-        description="bounds of the medial meniscus",
+        default=MeniscusParams(**asdict(BOUNDS.medial)), description="bounds of the medial meniscus"
     )
     lateral_meniscus: MeniscusParams = Field(
-        default=MeniscusParams(
-            height_mm=7.5,
-            anterior_width_mm=9.0,
-            posterior_width_mm=10.0,
-            anterior_inset_mm=3.0,
-            posterior_inset_mm=2.0,
-        ),
-        description="bounds of the lateral meniscus",
+        default=MeniscusParams(**asdict(BOUNDS.lateral)), description="bounds of the lateral meniscus"
     )
 
     def bounds(self) -> SurfaceBounds:
@@ -111,20 +109,13 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     names = (*params.reference, *params.moving)
     present = [name for name in names if name in reads[CASE_FACTS].structures]
     reference, moving, findings = _labelled(reads, params, out)
-    made = _made(Labelled(reference, moving, tuple(n for n in names if n not in present)), reads[ANATOMY], params, out)
+    missing = tuple(name for name in names if name not in present)
+    made = _made((reference, moving), missing, reads[ANATOMY], params, out)
     out[MADE_MESHES] = made.meshes
     out[REFERENCE_BODY] = _joined(reference, [made.meshes[name] for name in made.reference])
     out[MOVING_BODY] = _joined(moving, [made.meshes[name] for name in made.moving])
     out[SURFACE_ORIGINS] = _origins(params, present, made)
     return findings + made.findings + _missing_surfaces(names, (*present, *filled_in(names, made)))
-
-
-class Labelled(NamedTuple):
-    """Both bodies as labelled, and the structures that are missing on them."""
-
-    reference: TriangleMesh
-    moving: TriangleMesh
-    missing: tuple[str, ...]
 
 
 def _labelled(reads: Inputs, params: Params, out: Outputs) -> tuple[TriangleMesh, TriangleMesh, Findings]:
@@ -134,14 +125,16 @@ def _labelled(reads: Inputs, params: Params, out: Outputs) -> tuple[TriangleMesh
     return _of_meshes(meshes, params.reference, "reference"), _of_meshes(meshes, params.moving, "moving"), ()
 
 
-def _made(labelled: Labelled, anatomy: Anatomy, params: Params, out: Outputs) -> Made:
+def _made(
+    bodies: tuple[TriangleMesh, TriangleMesh], missing: tuple[str, ...], anatomy: Anatomy, params: Params, out: Outputs
+) -> Made:
     """What is missing, made from what is there, where that is wanted."""
     if params.missing_surfaces == "leave":
         return NOTHING_MADE
     request = Request(
-        names=labelled.missing,
-        reference=labelled.reference,
-        moving=labelled.moving,
+        names=missing,
+        reference=bodies[0],
+        moving=bodies[1],
         anatomy=anatomy,
         bounds=params.made.bounds(),
         triangle_mm2=params.made.triangle_mm2,

@@ -78,7 +78,7 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     out[LIGAMENTS] = _ligaments(source, files.ligaments)
     scan = _ct(source, files.ct, side)
     out[CT] = None if scan is None else scan.volume
-    seen = () if scan is None else (*scan.findings, *_set_aside(scan))
+    seen = () if scan is None else scan.findings
     if files.label_map is not None:
         label_map = read_label_map(read_file(source, files.label_map), files.label_map)
         return seen + _take_labels(label_map, files.label_map, params, facts, out)
@@ -145,13 +145,6 @@ def _ct(source: SourceFolder, names: tuple[str, ...], side: Side) -> CtScan | No
             "Correct 'side:' in case.yaml, or give the CT of the other leg.",
         )
     return scan
-
-
-def _set_aside(scan: CtScan) -> Findings:
-    if not scan.set_aside or any(finding.code == "N-DCM-01" for finding in scan.findings):
-        return ()
-    listed = ", ".join(f"{name} ({why})" for name, why in scan.set_aside[:8])
-    return (Finding("N-DCM-01", Severity.NOTE, f"Not part of the CT and set aside: {listed}."),)
 
 
 def _ligaments(source: SourceFolder, file: str | None) -> tuple[LigamentFibre, ...]:

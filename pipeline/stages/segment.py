@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
 from pydantic import Field
 
 from pipeline.artifacts import CASE_FACTS, CT, GIVEN_FACTS, GIVEN_LABELS, LABELS
 from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage, StrictParams
 from pipeline.errors import CaseRejected
 from pipeline.geometry.label_fit import BoneFit, bone_fit
-from pipeline.geometry.volume import CtVolume, LabelVolume, border_areas_mm2
+from pipeline.geometry.volume import CtVolume, LabelVolume
 from pipeline.records import CaseFacts
 
 if TYPE_CHECKING:
@@ -71,17 +70,13 @@ def _facts_of(facts: CaseFacts, found: BoneSegmentation) -> CaseFacts:
     labels = found.labels
     x, y, z = map(float, labels.spacing_mm)
     i, j, k = labels.values.shape
-    clipped = {
-        name: float(border_areas_mm2(np.asarray(labels.values) == value, labels.spacing_mm).sum())
-        for name, value in found.structures.items()
-    }
     return replace(
         facts,
         structures=dict(found.structures),
         voxels={name: bone.voxels for name, bone in found.bones.items()},
         spacing_mm=(x, y, z),
         shape=(i, j, k),
-        clipped_mm2=clipped,
+        clipped_mm2={name: bone.cut_mm2 for name, bone in found.bones.items()},
     )
 
 
