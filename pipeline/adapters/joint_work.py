@@ -7,7 +7,7 @@ library runs in worker processes. Every result is in the order of the tasks and 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -170,7 +170,8 @@ def _incrementally(bodies: Bodies, task: T, work: Callable[[Solver, T], R], sett
 
 def _examine(bodies: Bodies, task: Claim | Recheck, settings: SolverSettings) -> Any:
     if isinstance(task, Recheck):
-        return _incrementally(bodies, task, solve_recheck, settings)
+        quick = replace(settings.incremental, early_rejection=True)
+        return _incrementally(bodies, task, solve_recheck, replace(settings, incremental=quick))
     return prove(bodies, task, settings.proof.ladder_mm)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -105,9 +106,10 @@ def prove(bodies: Bodies, claim: Claim, ladder_mm: tuple[float, ...]) -> Proof:
     """Test a claimed pose on both sides of contact; measure the compartments that are not in contact."""
     contact, pose = AttitudeContact(bodies, *claim.angles_rad), claim.pose
     medial, lateral = claim.certificate.medial_gap_mm, claim.certificate.lateral_gap_mm
+    touching = lru_cache(lambda way: contact.touches(_pushed(pose, way)))
     return Proof(
-        gap_before_mm=_first(ladder_mm, lambda way: not contact.touches(_pushed(pose, -way))),
-        gap_after_mm=_first(ladder_mm, lambda way: contact.touches(_pushed(pose, way))),
+        gap_before_mm=_first(ladder_mm, lambda way: not touching(-way)),
+        gap_after_mm=_first(ladder_mm, touching),
         medial_gap_mm=medial if np.isfinite(medial) else contact.gap("medial", pose),
         lateral_gap_mm=lateral if np.isfinite(lateral) else contact.gap("lateral", pose),
     )

@@ -11,10 +11,10 @@ from pipeline.geometry.containment import nested
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.geometry.validation_objects import BallInDish, BarOnPyramids, ball, box, dish
 from pipeline.kinematics.certificate import equilibrium_residual
-from pipeline.kinematics.contact import AttitudeContact, Contacts, Pose
+from pipeline.kinematics.contact import AttitudeContact, Bodies, Contacts, Pose
 from pipeline.kinematics.descent import drop
-from pipeline.kinematics.incremental import StablePose, solve_incremental
-from pipeline.kinematics.joint_coordinates import attitude_rotation, rotation_x
+from pipeline.kinematics.incremental import IncrementalSettings, StablePose, solve_incremental
+from pipeline.kinematics.joint_coordinates import Float, attitude_rotation, rotation_x
 from pipeline.kinematics.ligaments import CORD_STIFFNESS, Fibres
 from pipeline.kinematics.table import Status
 from tests.kinematics.settings import (
@@ -341,3 +341,53 @@ def test_the_strap_turns_with_the_reference() -> None:
 def test_slack_fibres_change_nothing(pyramids: AttitudeContact, start: Pose) -> None:
     slack = Fibres(np.zeros((2, 3)), np.ones((2, 3)), np.array([200.0, 300.0]), np.array([5.0, 1.0]))
     assert solve_incremental(pulled(pyramids, slack), start, PAPER) == solve_incremental(pyramids, start, PAPER)
+
+
+class _Counted:
+    """Bodies that count how often they are asked whether they intersect."""
+
+    def __init__(self, bodies: Bodies) -> None:
+        self.bodies, self.asked = bodies, 0
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.bodies, name)
+
+    def intersect(self, rotation: Float, shift: Float) -> bool:
+        self.asked += 1
+        return self.bodies.intersect(rotation, shift)
+
+
+def quick_and_whole(
+    contact: AttitudeContact, start: Pose, settings: IncrementalSettings, monkeypatch: pytest.MonkeyPatch
+) -> tuple[tuple[StablePose, int], tuple[StablePose, int]]:
+    """The same search with early rejection and without, each with the number of collision tests."""
+    out = []
+    for early in (True, False):
+        counted = _Counted(contact.bodies)
+        with monkeypatch.context() as patch:
+            patch.setattr(contact, "bodies", counted)
+            out.append((solve_incremental(contact, start, replace(settings, early_rejection=early)), counted.asked))
+    return out[0], out[1]
+
+
+def test_early_rejection_saves_tests_and_changes_nothing(
+    pyramids: AttitudeContact, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = [quick_and_whole(pyramids, start, PAPER, monkeypatch) for start in BAR_STARTS]
+    assert all(quick == whole for (quick, _), (whole, _) in both)
+    assert sum(asked for (_, asked), _ in both) < 0.9 * sum(asked for _, (_, asked) in both)
+
+
+@each_tip_start
+def test_early_rejection_changes_nothing_where_fibres_pull(start: Pose, monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded = pulled(slide(), strap(0.5))
+    (quick, _), (whole, _) = quick_and_whole(loaded, start, PAPER, monkeypatch)
+    assert quick == whole
+
+
+def test_early_rejection_leaves_the_plain_rules_alone(
+    pyramids: AttitudeContact, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = replace(PAPER, classic=True)
+    (quick, asked), (whole, asked_whole) = quick_and_whole(pyramids, BAR_STARTS[0], settings, monkeypatch)
+    assert (quick, asked) == (whole, asked_whole)
