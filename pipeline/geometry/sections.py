@@ -7,26 +7,29 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.geometry.views import View
-from pipeline.geometry.volume import LabelVolume
+from pipeline.geometry.volume import CtVolume, LabelVolume
 
 Float = NDArray[np.float64]
 
 
-def label_slice(volume: LabelVolume, view: View, size_px: tuple[int, int]) -> NDArray[np.generic]:
-    """Labels on the plane through a view's focus, as that view shows it.
+def volume_slice(
+    volume: LabelVolume | CtVolume, view: View, size_px: tuple[int, int], outside: int = 0
+) -> NDArray[np.generic]:
+    """Labels or CT numbers on the plane through a view's focus, as that view shows it.
 
-    Each pixel takes the label of the voxel it lies in; nothing is interpolated.
+    Each pixel takes the value of the voxel it lies in; nothing is interpolated.
 
     Parameters
     ----------
-    volume : LabelVolume
+    volume : LabelVolume or CtVolume
     view : View
     size_px : (width, height)
+    outside : int
+        The value beyond the volume.
 
     Returns
     -------
     (height, width) array of the volume's type
-        0 outside the volume.
     """
     width, height = size_px
     scale = 2.0 * view.half_height_mm / height
@@ -37,7 +40,7 @@ def label_slice(volume: LabelVolume, view: View, size_px: tuple[int, int]) -> ND
     index = np.rint(points @ index_from_lps[:3, :3].T + index_from_lps[:3, 3]).astype(np.int64)
     inside = ((index >= 0) & (index < volume.values.shape)).all(axis=-1)
     i, j, k = np.where(inside[..., None], index, 0).transpose(2, 0, 1)
-    return np.where(inside, volume.values[i, j, k], 0).astype(volume.values.dtype)
+    return np.where(inside, volume.values[i, j, k], outside).astype(volume.values.dtype)
 
 
 def plane_section(mesh: TriangleMesh, point: Float, normal: Float) -> Float:

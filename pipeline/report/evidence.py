@@ -39,10 +39,15 @@ STATUS_WORDS = {
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the stages before left; ``findings`` is stage name -> its findings."""
+    """What the stages before left.
+
+    ``ct_cuts`` are the CT numbers (HU) on the planes of the slices picture, None without a CT; ``findings`` is stage
+    name -> its findings.
+    """
 
     facts: CaseFacts
     labels: LabelVolume | None
+    ct_cuts: tuple[NDArray[np.generic], ...] | None
     meshes: dict[str, TriangleMesh]
     mesh_quality: tuple[MeshQuality, ...]
     anatomy: Anatomy

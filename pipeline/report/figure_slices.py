@@ -1,4 +1,4 @@
-"""Picture: the label map cut in three planes, with the outlines of the surfaces made from it."""
+"""Picture: the CT, or else the label map, cut in three planes, with the outlines of the surfaces made from it."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from pipeline.adapters import pictures
 from pipeline.adapters.pictures import Image
-from pipeline.geometry.sections import label_slice, plane_section
+from pipeline.geometry.sections import plane_section, volume_slice
 from pipeline.geometry.views import Direction, View, view
-from pipeline.geometry.volume import LabelVolume
+from pipeline.geometry.volume import CtVolume
 from pipeline.report.evidence import Evidence, plain
 from pipeline.report.figure_frame import finished, mark_edges, title_panel
 from pipeline.report.palette import structure_color
@@ -20,24 +20,42 @@ Float = NDArray[np.float64]
 #: Part of the joint's width that a slice shows above and below its centre.
 HALF_HEIGHT_OF_WIDTH = 0.75
 PANEL_SHARE = 1.3
+#: Bone window: black and white of a CT, HU.
+WINDOW_HU = (-250.0, 1250.0)
+AIR_HU = -1024
 _PALE = (225, 225, 225)
 
 
 def slices_picture(evidence: Evidence, settings: PictureSettings) -> Image:
-    """Coronal, two sagittal and axial cuts of the label map.
+    """Coronal, two sagittal and axial cuts of the CT, or of the label map where the case brought none.
 
     Raises
     ------
     ValueError
-        When the case has no label map.
+        When the case has neither.
     """
-    if evidence.labels is None:
-        raise ValueError("the case brought surfaces, not a label map")
-    size = round(settings.panel_px * PANEL_SHARE)
-    panels = [_panel(evidence, evidence.labels, words, cut, size) for words, cut in _cuts(evidence, settings)]
+    cuts, size = _cuts(evidence, settings), _size(settings)
+    if evidence.ct_cuts is not None:
+        title = f"CT (bone window, {WINDOW_HU[0]:.0f} to {WINDOW_HU[1]:.0f} HU) and outlines of the surfaces (colour)"
+        greys = [_windowed(values) for values in evidence.ct_cuts]
+    elif evidence.labels is not None:
+        title = "Label map (grey, the case brought no CT) and outlines of the surfaces (colour)"
+        greys = [_greys(volume_slice(evidence.labels, cut, (size, size))) for _, cut in cuts]
+    else:
+        raise ValueError("the case brought surfaces, neither CT nor label map")
+    panels = [_panel(evidence, grey, words, cut) for grey, (words, cut) in zip(greys, cuts, strict=True)]
     legend = [(plain(name), structure_color(name)) for name in evidence.meshes]
-    title = "Label map (grey, there is no CT in this report) and outlines of the surfaces (colour)"
     return finished(evidence.facts, title, [pictures.tiled([panels])], legend)
+
+
+def ct_cuts(evidence: Evidence, ct: CtVolume, settings: PictureSettings) -> tuple[NDArray[np.generic], ...]:
+    """(size, size) CT numbers on each plane of the picture: all that a report needs of a CT."""
+    size = _size(settings)
+    return tuple(volume_slice(ct, cut, (size, size), AIR_HU) for _, cut in _cuts(evidence, settings))
+
+
+def _size(settings: PictureSettings) -> int:
+    return round(settings.panel_px * PANEL_SHARE)
 
 
 def _cuts(evidence: Evidence, settings: PictureSettings) -> list[tuple[str, View]]:
@@ -63,8 +81,8 @@ def _across(evidence: Evidence) -> Float:
     return np.asarray(offset[near if near.any() else slice(None), 0])
 
 
-def _panel(evidence: Evidence, volume: LabelVolume, words: str, cut: View, size: int) -> Image:
-    panel = _greys(label_slice(volume, cut, (size, size)))
+def _panel(evidence: Evidence, panel: Image, words: str, cut: View) -> Image:
+    size = len(panel)
     for name, mesh in evidence.meshes.items():
         segments = plane_section(mesh, cut.focus, cut.toward)
         ends = cut.pixels(segments.reshape(-1, 3), (size, size)).reshape(-1, 2, 2)
@@ -78,4 +96,13 @@ def _greys(labels: NDArray[np.generic]) -> Image:
     """Grey levels that differ between neighbouring label values; background nearly black."""
     values = labels.astype(np.int64)
     grey = np.where(values > 0, 70 + 23 * (values % 5), 18).astype(np.uint8)
+    return _grey_image(grey)
+
+
+def _windowed(values: NDArray[np.generic]) -> Image:
+    """CT numbers as a screen shows them."""
+    return _grey_image(np.interp(values.astype(np.float64), WINDOW_HU, (0.0, 255.0)).astype(np.uint8))
+
+
+def _grey_image(grey: NDArray[np.uint8]) -> Image:
     return np.ascontiguousarray(np.repeat(grey[..., None], 3, axis=2))

@@ -70,11 +70,11 @@ def _checks(evidence: Evidence, _: PictureSettings, limits: Limits) -> bytes:
 
 SLICES = Figure(
     "slices",
-    "Labels and surfaces in three planes",
+    "Surfaces in three planes",
     Caption(
-        "Cuts through the label map (grey) with the outlines of the surfaces made from it (colour).",
-        "Every outline runs along the border of its grey area, and cartilage lies on its bone.",
-        "An outline leaves its area, a structure is missing or sits on the wrong bone, left and right are exchanged.",
+        "Cuts through the CT, or the label map where there is none (grey), with the outlines of the surfaces (colour).",
+        "Every outline runs along the border of its bone or grey area, and cartilage lies on its bone.",
+        "An outline leaves its bone, a structure is missing or sits on the wrong bone, left and right are exchanged.",
         "Correct the segmentation, or the label names in case.yaml, and run the case again.",
     ),
     _slices,
@@ -137,9 +137,9 @@ CHECKS = Figure(
 
 
 def expected_figures(evidence: Evidence) -> tuple[Figure, ...]:
-    """The figures that the report of a case must have; slices only where the case brought a label map."""
+    """The figures that the report of a case must have; slices where there is a CT or a label map to cut."""
     rest = (BONES, POSES, CONTACT, CURVES, CHECKS)
-    return rest if evidence.facts.source == "meshes" else (SLICES, *rest)
+    return rest if evidence.labels is None and evidence.ct_cuts is None else (SLICES, *rest)
 
 
 def drawn(figure: Figure, evidence: Evidence, settings: PictureSettings, limits: Limits) -> Drawn:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from itertools import count
 
@@ -12,6 +13,7 @@ from pipeline.adapters.workers import map_in_order
 from pipeline.artifacts import (
     ANATOMY,
     CASE_FACTS,
+    CT,
     LABELS,
     MADE_MESHES,
     MESH_QUALITY,
@@ -31,6 +33,7 @@ from pipeline.engine.stage import Findings, Inputs, Outputs, Stage, StrictParams
 from pipeline.errors import EnvironmentFault
 from pipeline.report.build import STYLE, TEMPLATE, Page, report_files
 from pipeline.report.evidence import Evidence
+from pipeline.report.figure_slices import ct_cuts
 from pipeline.report.figures import Drawn, drawn, expected_figures
 from pipeline.report.metrics import all_metrics
 from pipeline.report.settings import Limits, PictureSettings
@@ -51,7 +54,7 @@ class Params(StrictParams):
 
 def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     """Measure, draw, judge, and write the report."""
-    evidence = gather(reads)
+    evidence = gather(reads, params.pictures)
     metrics = all_metrics(evidence, params.limits)
     pictures = _draw(evidence, params, out)
     missing = {item.figure.title: item.problem for item in pictures if not item.data}
@@ -62,11 +65,12 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     return findings
 
 
-def gather(reads: Inputs) -> Evidence:
+def gather(reads: Inputs, pictures: PictureSettings) -> Evidence:
     """What the stages before left, as evidence."""
-    return Evidence(
+    evidence = Evidence(
         facts=reads[CASE_FACTS],
         labels=reads[LABELS],
+        ct_cuts=None,
         meshes=reads[MESHES] | reads[MADE_MESHES],
         mesh_quality=reads[MESH_QUALITY],
         anatomy=reads[ANATOMY],
@@ -80,6 +84,8 @@ def gather(reads: Inputs) -> Evidence:
         smooth=reads[SMOOTH_TABLE],
         findings={name: reads[artifact] for name, artifact in FINDINGS.items()},
     )
+    ct = reads[CT]
+    return evidence if ct is None else replace(evidence, ct_cuts=ct_cuts(evidence, ct, pictures))
 
 
 def _draw(evidence: Evidence, params: Params, out: Outputs) -> list[Drawn]:
@@ -103,6 +109,7 @@ STAGE = Stage(
     reads=(
         CASE_FACTS,
         LABELS,
+        CT,
         MESHES,
         MADE_MESHES,
         MESH_QUALITY,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.mesh import TriangleMesh, transformed
-from pipeline.geometry.sections import label_slice, plane_section
+from pipeline.geometry.sections import plane_section, volume_slice
 from pipeline.geometry.views import view
 from pipeline.geometry.volume import LabelVolume
 from pipeline.records import Side
@@ -43,7 +43,7 @@ def test_a_slice_shows_the_voxel_under_each_pixel(side: Side) -> None:
     index = np.eye(4)
     index[:3, 3] = -4.0
     seen = view(frame, "anterior", frame[:3, 3], 4.5)
-    shown = label_slice(LabelVolume(values, frame @ index), seen, (9, 9))
+    shown = volume_slice(LabelVolume(values, frame @ index), seen, (9, 9))
     assert shown.dtype == np.uint8
     assert np.argwhere(shown == 3).tolist() == [[4, 1 if side == "right" else 7]]
     assert np.argwhere(shown == 5).tolist() == [[2, 4]]
@@ -51,7 +51,7 @@ def test_a_slice_shows_the_voxel_under_each_pixel(side: Side) -> None:
 
 def test_outside_the_volume_is_background() -> None:
     volume = LabelVolume(np.ones((2, 2, 2), dtype=np.uint16), np.eye(4))
-    shown = label_slice(volume, view(np.eye(4), "proximal", np.array([100.0, 0.0, 0.0]), 5.0), (6, 4))
+    shown = volume_slice(volume, view(np.eye(4), "proximal", np.array([100.0, 0.0, 0.0]), 5.0), (6, 4))
     assert shown.shape == (4, 6)
     assert not shown.any()
 
@@ -64,7 +64,7 @@ def test_slice_and_section_agree_on_where_a_ball_is() -> None:
     index[:3, 3] = -12.0
     volume = LabelVolume((np.linalg.norm(grid, axis=-1) <= RADIUS).astype(np.uint8), frame @ index)
     seen = view(frame, "medial", frame[:3, 3] + 4.0 * frame[:3, 0], 15.0)
-    area = np.count_nonzero(label_slice(volume, seen, (300, 300))) * 0.1**2
+    area = np.count_nonzero(volume_slice(volume, seen, (300, 300))) * 0.1**2
     ends = seen.pixels(plane_section(mesh, seen.focus, seen.toward).reshape(-1, 3), (300, 300))
     reach = np.linalg.norm(ends - 150.0, axis=1).max() / 10.0
     assert area == pytest.approx(np.pi * reach**2, rel=0.02)

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 from pipeline.artifacts import (
     ANATOMY,
     CASE_FACTS,
+    CT,
     LABELS,
     MADE_MESHES,
     MESH_QUALITY,
@@ -32,7 +33,7 @@ class MemoryReads:
     """Artifacts by name."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        self.values = values
+        self.values = dict(values)
 
     def __getitem__(self, artifact: Artifact[T]) -> T:
         value: T = self.values[artifact.name]
@@ -64,6 +65,7 @@ def reads_of(evidence: Evidence) -> MemoryReads:
     values: dict[str, Any] = {
         CASE_FACTS.name: evidence.facts,
         LABELS.name: evidence.labels,
+        CT.name: None,
         MESHES.name: evidence.meshes,
         MESH_QUALITY.name: evidence.mesh_quality,
         ANATOMY.name: evidence.anatomy,

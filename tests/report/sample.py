@@ -66,6 +66,7 @@ def sample_evidence(side: Side = "right", case_id: str = "SAMPLE-1") -> Evidence
     return Evidence(
         facts=_facts(side, case_id),
         labels=_labels(frame),
+        ct_cuts=None,
         meshes=meshes,
         mesh_quality=tuple(MeshQuality(name, 1000, 1010.0, 1000.0, 0.1, 0.4, 0, 0) for name in meshes),
         anatomy=_anatomy(side, frame),

@@ -10,6 +10,7 @@ import pytest
 
 from pipeline.adapters import pictures
 from pipeline.adapters.pictures import Image, Text
+from pipeline.geometry.volume import CtVolume
 from pipeline.kinematics.table import Status
 from pipeline.records import Side
 from pipeline.report import figure_curves
@@ -17,7 +18,7 @@ from pipeline.report.evidence import Evidence
 from pipeline.report.figure_bones import bones_picture
 from pipeline.report.figure_curves import shown_varus
 from pipeline.report.figure_poses import body_colors, contact_picture, distance_colors, near_distances, poses_picture
-from pipeline.report.figure_slices import slices_picture
+from pipeline.report.figure_slices import ct_cuts, slices_picture
 from pipeline.report.figures import drawn, expected_figures
 from pipeline.report.palette import BONE, OVERLAP, structure_color
 from pipeline.report.settings import Limits, PictureSettings
@@ -120,8 +121,36 @@ def test_a_case_of_meshes_has_no_slices() -> None:
     meshes = replace(evidence, facts=replace(evidence.facts, source="meshes"), labels=None)
     assert next(figure.name for figure in expected_figures(evidence)) == "slices"
     assert "slices" not in [figure.name for figure in expected_figures(meshes)]
-    with pytest.raises(ValueError, match="brought surfaces, not a label map"):
+    with pytest.raises(ValueError, match="brought surfaces, neither CT nor label map"):
         slices_picture(meshes, SMALL)
+
+
+def cut_ct(evidence: Evidence) -> Evidence:
+    """The same case with a CT: bone where the labels are, soft tissue in one half of the scan, air in the other."""
+    assert evidence.labels is not None
+    labelled = np.asarray(evidence.labels.values) > 0
+    values = np.full(labelled.shape, -1000, dtype=np.int16)
+    values[: len(values) // 2] = 40
+    values[labelled] = 1400
+    ct = CtVolume(values, evidence.labels.lps_from_index)
+    return replace(evidence, ct_cuts=ct_cuts(evidence, ct, SMALL))
+
+
+def test_slices_show_the_ct_in_a_bone_window(written: list[str]) -> None:
+    evidence = sample_evidence()
+    shown, plain = slices_picture(cut_ct(evidence), SMALL), slices_picture(evidence, SMALL)
+    assert "CT (bone window, -250 to 1250 HU) and outlines of the surfaces (colour)" in written
+    assert shown.shape == plain.shape
+    greys = shown[(np.ptp(shown.astype(np.int64), axis=-1) == 0)]
+    bone, tissue, air = ((greys == level).all(axis=-1).sum() for level in (255, 49, 0))
+    assert min(bone, tissue, air) > 1000
+
+
+def test_a_ct_beside_meshes_is_shown() -> None:
+    evidence = cut_ct(sample_evidence())
+    meshes = replace(evidence, facts=replace(evidence.facts, source="meshes"), labels=None)
+    assert expected_figures(meshes)[0].name == "slices"
+    assert np.array_equal(slices_picture(meshes, SMALL), slices_picture(evidence, SMALL))
 
 
 def test_charts_hold_at_most_five_varus_with_the_neutral_one() -> None:

@@ -12,13 +12,14 @@ import pytest
 
 from pipeline.adapters import rendering
 from pipeline.adapters.workers import map_in_order
-from pipeline.artifacts import REPORT, VERDICT
+from pipeline.artifacts import CT, REPORT, VERDICT
 from pipeline.engine.stage import Findings, Severity
 from pipeline.errors import EnvironmentFault
+from pipeline.geometry.volume import CtVolume
 from pipeline.kinematics.table import Status
 from pipeline.report import figures
 from pipeline.report.settings import Limits, PictureSettings
-from pipeline.stages.qa import STAGE, Params
+from pipeline.stages.qa import STAGE, Params, gather
 from tests.adapters.worker_tasks import die
 from tests.report.memory import MemoryOutputs, reads_of
 from tests.report.sample import only_one_attitude, sample_evidence, with_status
@@ -97,9 +98,24 @@ def test_a_picture_that_cannot_be_drawn_is_missed(monkeypatch: pytest.MonkeyPatc
     out = MemoryOutputs()
     (finding,) = STAGE.run(reads_of(sample_evidence()), SMALL, out)
     assert finding.code == "W-QA-10"
-    assert finding.message == "The picture 'Labels and surfaces in three planes' is missing: nothing to see."
+    assert finding.message == "The picture 'Surfaces in three planes' is missing: nothing to see."
     assert b"This picture is missing: nothing to see." in out.value(REPORT)["report.html"]
     assert "images/slices.png" not in out.value(REPORT)
+
+
+def test_of_a_ct_the_report_keeps_the_planes_it_shows() -> None:
+    evidence = sample_evidence()
+    assert evidence.labels is not None
+    ct = CtVolume(np.asarray(evidence.labels.values).astype(np.int16) * 100 - 50, evidence.labels.lps_from_index)
+    reads = reads_of(evidence)
+    assert gather(reads, SMALL.pictures).ct_cuts is None
+    reads.values[CT.name] = ct
+    cuts = gather(reads, SMALL.pictures).ct_cuts
+    assert cuts is not None
+    assert len(cuts) == 4
+    for cut in cuts:
+        assert set(np.unique(cut)) <= {-1024, *(100 * np.unique(evidence.labels.values).astype(int) - 50)}
+        assert (cut > 0).any()
 
 
 def test_settings_read_as_a_protocol_gives_them() -> None:
