@@ -31,7 +31,15 @@ from tests.validate.measured_motion import KNEE as KNEE_JAM
 
 DATA = KNEE_JAM.parent
 Knee = Literal["knee_mr_a", "knee_jam"]
-Kind = Literal["labelled", "bones", "ct", "coarse_ct"]
+Kind = Literal["labelled", "bones", "ct", "fine_ct", "noisy_ct", "thick_ct", "coarse_ct"]
+#: Synthetic CTs: voxel size, noise, and one leg or two.
+SCANS: dict[str, SyntheticCtSpec] = {
+    "ct": SyntheticCtSpec(spacing_mm=(0.6, 0.6, 0.6), noise_hu=15.0),
+    "fine_ct": SyntheticCtSpec(spacing_mm=(0.4, 0.4, 0.4), noise_hu=30.0),
+    "noisy_ct": SyntheticCtSpec(spacing_mm=(0.6, 0.6, 0.6), noise_hu=60.0),
+    "thick_ct": SyntheticCtSpec(spacing_mm=(0.6, 0.6, 1.5), noise_hu=15.0),
+    "coarse_ct": SyntheticCtSpec(spacing_mm=(0.6, 0.6, 1.5), noise_hu=40.0, other_leg="left"),
+}
 #: As ``pipeline/configs/labels/mskt.yaml``.
 BONES = {"femur": 5, "tibia": 6, "patella": 7, "fibula": 8}
 GRID = (
@@ -64,14 +72,8 @@ def _case(folder: Path, knee: Knee, kind: Kind) -> Path:
     labels = _labels(knee)
     present = {name: value for name, value in BONES.items() if (labels.values == value).any()}
     declared = "labels: mskt" if kind == "labelled" else f"labels: {present}"
-    if kind in ("ct", "coarse_ct"):
-        coarse = kind == "coarse_ct"
-        spec = SyntheticCtSpec(
-            spacing_mm=(0.6, 0.6, 1.5) if coarse else (0.6, 0.6, 0.6),
-            noise_hu=40.0 if coarse else 15.0,
-            other_leg="left" if coarse else None,
-        )
-        (folder / "ct.nrrd").write_bytes(encode_nrrd(synthetic_ct(labels, present, spec)))
+    if kind in SCANS:
+        (folder / "ct.nrrd").write_bytes(encode_nrrd(synthetic_ct(labels, present, SCANS[kind])))
         declared = ""
     else:
         (folder / "labels.nrrd").write_bytes(encode_nrrd(labels))
@@ -146,16 +148,19 @@ def _differences(knee: Knee, kinds: tuple[Kind, Kind], limits: tuple[float, ...]
     return [_difference(knee, kinds, curve, limit) for curve, limit in zip(CURVES, limits, strict=True)]
 
 
+def _of_a_scan(knee: Knee, kind: Kind) -> list[Measurement]:
+    """A synthetic CT against the bones it was made from."""
+    return [_knee_lost(knee, kind), *_differences(knee, (kind, "bones"), (1.5, 4.0, 1.0, 10.0))]
+
+
+KINDS_OF_CT: tuple[Kind, ...] = ("ct", "fine_ct", "noisy_ct", "thick_ct", "coarse_ct")
 ROWS: tuple[Measurement, ...] = (
     (
         _knee_lost("knee_mr_a", "bones"),
         *_differences("knee_mr_a", ("bones", "labelled"), (2.0, 5.0, 1.5, 15.0)),
         _knee_lost("knee_jam", "bones"),
         *_differences("knee_jam", ("bones", "labelled"), (2.5, 7.0, 3.0, 18.0)),
-        _knee_lost("knee_mr_a", "ct"),
-        *_differences("knee_mr_a", ("ct", "bones"), (1.5, 4.0, 1.0, 10.0)),
-        _knee_lost("knee_mr_a", "coarse_ct"),
-        *_differences("knee_mr_a", ("coarse_ct", "bones"), (1.5, 4.0, 1.0, 10.0)),
+        *(row for kind in KINDS_OF_CT for row in _of_a_scan("knee_mr_a", kind)),
         *(_leg_lost(name, 1.0 if name == "p2sd1" else 0.0) for name in LEGS),
     )
     if KNEE_JAM.exists()
