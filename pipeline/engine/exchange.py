@@ -63,11 +63,24 @@ class Shelf:
 
 
 @dataclass(frozen=True)
+class WatchedFolder(SourceFolder):
+    """A case folder that tells which file is read next, so that it can be named if that ends badly."""
+
+    opened: Callable[[str], None]
+
+    def read(self, name: str) -> bytes:
+        """Bytes of one listed file; raises what ``SourceFolder.read`` raises."""
+        self.opened(name)
+        return super().read(name)
+
+
+@dataclass(frozen=True)
 class StageInputs:
-    """``reads[ARTIFACT]`` for one stage."""
+    """``reads[ARTIFACT]`` for one stage; ``opened`` is told each file of the case folder that is read."""
 
     stage: Stage
     shelf: Shelf
+    opened: Callable[[str], None] = lambda _: None
 
     def __getitem__(self, artifact: Artifact[T]) -> T:
         """The decoded value of a declared artifact.
@@ -82,7 +95,8 @@ class StageInputs:
         if artifact.name not in {declared.name for declared in self.stage.reads}:
             raise KeyError(f"stage {self.stage.name} does not declare {artifact.name} in reads")
         if artifact.name == SOURCE.name:
-            return cast("T", self.shelf.source)
+            source = self.shelf.source
+            return cast("T", WatchedFolder(source.case_id, source.root, source.files, self.opened))
         return self.shelf.load(artifact)
 
 

@@ -6,12 +6,13 @@ The only place of the engine that turns exceptions into the outcome of a run.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 
 from pipeline.engine.cache import Lookup, look_up
+from pipeline.engine.confinement import Channel, ConfinedBug, Confinement, Made, confined
 from pipeline.engine.exchange import Shelf, StageInputs, StageOutputs
 from pipeline.engine.inspection import (
     CaseStatus,
@@ -194,19 +195,44 @@ def _computed(run: _Run, stage: Stage, shelf: Shelf, found: Lookup) -> Manifest:
     folder = run.job.results / stage.folder
     if found.damaged:
         set_aside(folder)
-    run.announce(stage, found.reason)
-    out = StageOutputs(stage, run.execution.jobs, partial(run.listener.stage_progress, stage.name))
+    with _begun(run, stage, shelf) as work:
+        run.announce(stage, found.reason)
+        made = work()
     settings = run.settings[stage.name]
-    findings = stage.run(StageInputs(stage, shelf), settings, out)
     listed, used = findings_artifact(stage.name), settings_artifact(stage.name)
-    own = {listed.name: listed.encode(findings), used.name: used.encode(settings.model_dump(mode="json"))}
-    files = stage_files(stage, {**out.complete(), **own})
+    own = {listed.name: listed.encode(made.findings), used.name: used.encode(settings.model_dump(mode="json"))}
+    files = stage_files(stage, {**made.held, **own})
     recipe, outputs = found.recipe, _output_records(files)
-    manifest = Manifest(recipe.key, recipe, outputs, findings, run.seconds, found.sources)
+    manifest = Manifest(recipe.key, recipe, outputs, made.findings, run.seconds, found.sources)
     data = {name: content for name, (_, content) in files.items()}
     commit_folder(folder, {**data, MANIFEST_FILE: encode_manifest(manifest)})
-    _log_findings(run.log, stage, findings)
+    _log_findings(run.log, stage, made.findings)
     return manifest
+
+
+@contextmanager
+def _begun(run: _Run, stage: Stage, shelf: Shelf) -> Iterator[Callable[[], Made]]:
+    """The work of a stage; in a child process from the moment this is entered where the stage has limits."""
+    progress = partial(run.listener.stage_progress, stage.name)
+    if stage.limits is None:
+        yield partial(_made, run, StageInputs(stage, shelf), progress)
+        return
+
+    def work(channel: Channel) -> Made:
+        return _made(run, StageInputs(stage, shelf, channel.opened), channel.progress)
+
+    def warn(sentence: str) -> None:
+        run.log.write(LogLine("warning", sentence, stage.name))
+
+    folders = (shelf.source.root, shelf.root.resolve())
+    with confined(Confinement(stage, folders, shelf.source.files, progress, warn), work) as result:
+        yield result
+
+
+def _made(run: _Run, reads: StageInputs, progress: Callable[[int, int], None]) -> Made:
+    out = StageOutputs(reads.stage, run.execution.jobs, progress)
+    findings = reads.stage.run(reads, run.settings[reads.stage.name], out)
+    return Made(findings, out.complete())
 
 
 def _output_records(files: Mapping[str, tuple[str, bytes]]) -> dict[str, OutputRecord]:
@@ -228,13 +254,19 @@ def _understood(run: _Run, error: BaseException) -> PipelineError:
     stage = run.current.name if run.current else "case"
     if isinstance(error, OSError) and is_environmental(error):
         return environment_fault(error, f"Stage {stage}")
-    number = error_id(error)
-    run.log.write(LogLine("error", f"error id {number}\n{private_traceback(error)}", stage, _BUG))
+    number, trace = _identified(error)
+    run.log.write(LogLine("error", f"error id {number}\n{trace}", stage, _BUG))
     return PipelineError(
         _BUG,
         f"The program made a mistake in stage {stage} (error id {number}); nothing was published from it.",
         f"Send {LOG_FILE} of this case's results folder to the maintainers; it holds no patient data.",
     )
+
+
+def _identified(error: BaseException) -> tuple[str, str]:
+    if isinstance(error, ConfinedBug):
+        return error.number, error.trace
+    return error_id(error), private_traceback(error)
 
 
 def _failure(run: _Run, error: PipelineError) -> RunOutcome:

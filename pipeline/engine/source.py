@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from pipeline.engine.artifacts import SourceFolder
@@ -12,6 +14,9 @@ from pipeline.engine.storage_faults import storage
 from pipeline.engine.store import fingerprint_on_disk
 from pipeline.errors import CaseRejected
 
+#: A folder with more is not the case of one joint; listing it would take minutes, for nothing.
+MAX_FILES = 100_000
+MAX_BYTES = 100_000_000_000
 #: Left in folders by file managers; hidden files are ignored as well.
 _JUNK = frozenset({"thumbs.db", "desktop.ini", "__macosx"})
 
@@ -32,18 +37,30 @@ def list_source(case_id: str, root: Path) -> SourceFolder:
     ------
     CaseRejected
         ``E-IO-02`` for a link that leaves the folder or points nowhere, ``E-IO-03`` for a folder that is missing or
-        empty, ``E-IO-04`` for a file or folder that may not be read, ``E-IO-05`` for a name that is not text.
+        empty, ``E-IO-04`` for a file or folder that cannot be read, ``E-IO-05`` for a name that is not text,
+        ``E-IO-14`` for more than MAX_FILES or MAX_BYTES.
     EnvironmentFault
         When the disk fails.
     """
     if not root.is_dir():
         raise _nothing(case_id, "does not exist")
     real = root.resolve()
-    with storage("Reading the case folder"):
-        files = {_name(path, real): _sha256(path, real) for path in _walk(real, real)}
+    with storage("Reading the case folder"), _short_paths(case_id):
+        files = {_name(path, real): _sha256(path, real) for path in _walk(real)}
     if not files:
         raise _nothing(case_id, "holds no files")
     return SourceFolder(case_id, real, dict(sorted(files.items())))
+
+
+@contextmanager
+def _short_paths(case_id: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        problem = f"A file of {case_id} cannot be read: its folders lie too deep inside each other."
+        raise CaseRejected("E-IO-04", problem, "Move the files up, into the case folder itself.") from error
 
 
 def source_hash(files: Mapping[str, str]) -> str:
@@ -51,20 +68,37 @@ def source_hash(files: Mapping[str, str]) -> str:
     return hash_of_files(files)
 
 
-def _walk(folder: Path, root: Path) -> Iterator[Path]:
-    for path in sorted(_entries(folder, root)):
+def _walk(root: Path) -> Iterator[Path]:
+    """Every regular file, in the order of the names; without recursion, however deep they lie."""
+    waiting, count, size = [root], 0, 0
+    while waiting:
+        path = waiting.pop()
+        count += 1
+        _check_amount(count, size)
         if path.is_symlink():
             _check_link(path, root)
         elif path.is_dir():
-            yield from _walk(path, root)
+            waiting += reversed(_entries(path, root))
             continue
         if path.is_file():
+            size += path.stat().st_size
+            _check_amount(count, size)
             yield path
+
+
+def _check_amount(count: int, size: int) -> None:
+    if count > MAX_FILES:
+        problem = f"The case folder holds more than {MAX_FILES} files and folders."
+    elif size > MAX_BYTES:
+        problem = f"The case folder holds more than {MAX_BYTES / 1e9:.0f} GB."
+    else:
+        return
+    raise CaseRejected("E-IO-14", problem, "Keep the scan of the one joint there and move everything else out.")
 
 
 def _entries(folder: Path, root: Path) -> list[Path]:
     try:
-        return [path for path in folder.iterdir() if not _is_junk(path.name)]
+        return sorted(path for path in folder.iterdir() if not _is_junk(path.name))
     except PermissionError as error:
         raise _unreadable(folder, root) from error
 

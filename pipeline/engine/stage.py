@@ -76,6 +76,22 @@ class Outputs(Protocol):
 
 
 @dataclass(frozen=True)
+class Limits:
+    """What the child process of a confined stage may use.
+
+    Attributes
+    ----------
+    memory_bytes : int
+        Beyond what it begins with; never more than three quarters of the computer's memory.
+    wall_s : float
+        Seconds, of the clock and of the processor.
+    """
+
+    memory_bytes: int = 16_000_000_000
+    wall_s: float = 600.0
+
+
+@dataclass(frozen=True)
 class Stage:
     """One step of the flow.
 
@@ -91,6 +107,9 @@ class Stage:
         ``run(reads, params, out) -> Findings``; loads, calls the maths, saves.
     resources : tuple of str
         Package data files (``package:file``) that decide its output besides code, such as report templates.
+    limits : Limits, optional
+        Of a stage that reads foreign bytes: it works in a sealed child process of its own, with these limits, and
+        cannot start processes. Without them it works in the process of the run.
     """
 
     number: int
@@ -100,6 +119,7 @@ class Stage:
     Params: type[StrictParams]
     run: Callable[[Inputs, Any, Outputs], Findings]
     resources: tuple[str, ...] = field(default=())
+    limits: Limits | None = None
 
     @property
     def folder(self) -> str:

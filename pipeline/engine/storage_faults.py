@@ -37,6 +37,7 @@ _KINDS = {
     errno.EMFILE: _LIMIT,
     errno.ENFILE: _LIMIT,
     errno.ENOMEM: _LIMIT,
+    errno.EAGAIN: _LIMIT,  # no more processes
 }
 
 

@@ -2,10 +2,12 @@ from __future__ import annotations
 
 import hashlib
 import os
+import subprocess
 from pathlib import Path
 
 import pytest
 
+from pipeline.engine import source
 from pipeline.engine.source import list_source, source_hash
 from pipeline.errors import CaseRejected
 
@@ -20,10 +22,10 @@ def case(tmp_path: Path) -> Path:
 
 
 def test_regular_files_are_listed_with_their_hashes_in_order(case: Path) -> None:
-    source = list_source("P1", case)
-    assert list(source.files) == ["ct/slice1.dcm", "labels.nrrd"]
-    assert source.files["labels.nrrd"] == hashlib.sha256(b"labels").hexdigest()
-    assert source.read("ct/slice1.dcm") == b"one"
+    listed = list_source("P1", case)
+    assert list(listed.files) == ["ct/slice1.dcm", "labels.nrrd"]
+    assert listed.files["labels.nrrd"] == hashlib.sha256(b"labels").hexdigest()
+    assert listed.read("ct/slice1.dcm") == b"one"
 
 
 def test_what_programs_leave_behind_is_ignored(case: Path) -> None:
@@ -56,9 +58,9 @@ def test_links_that_stay_inside_are_read_once(case: Path) -> None:
     (case / "first.dcm").symlink_to("ct/slice1.dcm")
     (case / "again").symlink_to("ct")
     (case / "ct" / "up").symlink_to("..")
-    source = list_source("P1", case)
-    assert list(source.files) == ["ct/slice1.dcm", "first.dcm", "labels.nrrd"]
-    assert source.read("first.dcm") == b"one"
+    listed = list_source("P1", case)
+    assert list(listed.files) == ["ct/slice1.dcm", "first.dcm", "labels.nrrd"]
+    assert listed.read("first.dcm") == b"one"
 
 
 @pytest.mark.parametrize("target", ["/etc/passwd", "../other/labels.nrrd", "..", "missing", "loop"])
@@ -96,7 +98,43 @@ def test_an_unreadable_file_is_rejected(case: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_a_file_that_changes_after_it_was_listed_is_noticed(case: Path) -> None:
-    source = list_source("P1", case)
+    listed = list_source("P1", case)
     (case / "labels.nrrd").write_bytes(b"still being copied")
     with pytest.raises(ValueError, match=r"labels\.nrrd changed while it was being read"):
-        source.read("labels.nrrd")
+        listed.read("labels.nrrd")
+
+
+@pytest.mark.fault("D25")
+def test_folders_however_deep_are_listed_and_too_deep_are_refused(case: Path) -> None:
+    here = os.open(case, os.O_RDONLY)
+    try:
+        for depth in range(1, 2051):
+            os.mkdir("d", dir_fd=here)
+            inner = os.open("d", os.O_RDONLY, dir_fd=here)
+            os.close(here)
+            here = inner
+            if depth == 1500:  # deeper than functions can call one another
+                os.close(os.open("deep.txt", os.O_CREAT | os.O_WRONLY, dir_fd=here))
+                assert f"{'d/' * 1500}deep.txt" in list_source("P1", case).files
+        with pytest.raises(CaseRejected, match=r"^E-IO-04 A file of P1 cannot be read: its folders lie too deep"):
+            list_source("P1", case)
+    finally:
+        os.close(here)
+        subprocess.run(["rm", "-rf", str(case)], check=True)  # deeper than the clean-up of pytest can go
+
+
+@pytest.mark.fault("D25")
+def test_no_more_files_than_one_joint_has(case: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(source, "MAX_FILES", 4)  # two files in two folders
+    assert len(list_source("P1", case).files) == 2
+    (case / "empty").mkdir()
+    with pytest.raises(CaseRejected, match=r"^E-IO-14 The case folder holds more than 4 files and folders\."):
+        list_source("P1", case)
+
+
+@pytest.mark.fault("D25")
+def test_a_huge_file_is_refused_before_it_is_read(case: Path) -> None:
+    with (case / "huge.raw").open("wb") as stream:
+        stream.truncate(10**13)
+    with pytest.raises(CaseRejected, match=r"^E-IO-14 The case folder holds more than 100 GB\."):
+        list_source("P1", case)
