@@ -8,6 +8,7 @@ from pathlib import PurePosixPath
 
 from pipeline.engine.artifacts import SourceFolder
 from pipeline.errors import CaseRejected
+from pipeline.files.checksums import is_checksum_list
 from pipeline.files.ct_volumes import CT_ENDINGS
 from pipeline.files.ligaments_file import LIGAMENTS_FILE
 from pipeline.files.markups import MARKUP_ENDINGS
@@ -34,6 +35,8 @@ class CaseFiles:
         Structure name -> file; empty where the case brought a label map.
     landmarks : str or None
     ligaments : str or None
+    checksums : tuple of str
+        Lists of checksums that came along.
     """
 
     ct: tuple[str, ...]
@@ -41,6 +44,7 @@ class CaseFiles:
     meshes: Mapping[str, str]
     landmarks: str | None
     ligaments: str | None
+    checksums: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -70,7 +74,8 @@ def choose_files(names: Collection[str]) -> CaseFiles:
         raise _several("mesh of one structure", meshes)
     landmarks = _at_most_one("landmark file", [name for name in top if name.lower().endswith(MARKUP_ENDINGS)])
     ligaments = _at_most_one("ligament file", [name for name in top if name.lower() == LIGAMENTS_FILE])
-    return CaseFiles(ct, maps[0] if maps else None, by_structure, landmarks, ligaments)
+    checksums = tuple(sorted(filter(is_checksum_list, names)))
+    return CaseFiles(ct, maps[0] if maps else None, by_structure, landmarks, ligaments, checksums)
 
 
 def read_file(source: SourceFolder, name: str) -> bytes:
@@ -81,19 +86,19 @@ def read_file(source: SourceFolder, name: str) -> bytes:
     CaseRejected
         E-IO-14 for a file beyond MAX_FILE_BYTES, E-IO-17 for one that changed since the run began.
     """
-    if (size := (source.root / name).stat().st_size) > MAX_FILE_BYTES:
-        problem = f"{name} has {size / 1e9:.1f} GB, expected at most {MAX_FILE_BYTES / 1e9:.0f} GB."
-        raise CaseRejected("E-IO-14", problem, "Crop the label map to the joint.")
     try:
+        if (size := (source.root / name).stat().st_size) > MAX_FILE_BYTES:
+            problem = f"{name} has {size / 1e9:.1f} GB, expected at most {MAX_FILE_BYTES / 1e9:.0f} GB."
+            raise CaseRejected("E-IO-14", problem, "Crop the label map to the joint.")
         return source.read(name)
-    except ValueError as error:
+    except (FileNotFoundError, ValueError) as error:
         action = "Wait until the file is copied completely, then run again."
         raise CaseRejected("E-IO-17", f"{name} changed while it was being read.", action) from error
 
 
 def _ct_files(names: Collection[str], top: list[str]) -> tuple[str, ...]:
     """Everything in ``ct/``, or the one CT in a file of its own."""
-    series = tuple(sorted(name for name in names if name.startswith(CT_FOLDER)))
+    series = tuple(sorted(name for name in names if name.startswith(CT_FOLDER) and not is_checksum_list(name)))
     single = [name for name in top if name.lower().startswith("ct.") and name.lower().endswith(CT_ENDINGS)]
     if len(single) + bool(series) > 1:
         raise _several("CT", [*single, *([CT_FOLDER] if series else [])])
@@ -102,7 +107,7 @@ def _ct_files(names: Collection[str], top: list[str]) -> tuple[str, ...]:
 
 def _is_label_map(name: str) -> bool:
     endings = LABEL_MAP_ENDINGS + DETACHED_ENDINGS  # the latter so that their reader can say why not
-    return name.endswith(".seg.nrrd") or (name.startswith("labels.") and name.endswith(endings))
+    return name.endswith((".seg.nrrd", ".seg.dcm")) or (name.startswith("labels.") and name.endswith(endings))
 
 
 def _at_most_one(what: str, names: list[str]) -> str | None:
@@ -115,7 +120,7 @@ def _no_segmentation(top: list[str]) -> CaseRejected:
     return CaseRejected(
         "E-IO-15",
         f"The case folder holds neither a CT nor a label map; it holds {', '.join(top[:8]) or 'no files'}.",
-        "Put the DICOM files of the CT into its folder ct, or the segmentation there as labels.nii.gz or labels.nrrd.",
+        "Put the DICOM files of the CT into its folder ct, or the segmentation there as labels.nii.gz, labels.nrrd or labels.dcm.",
     )
 
 

@@ -77,6 +77,8 @@ class CtScan:
     laterality : str or None
         ``right`` or ``left`` where every slice says so.
     facts : CtFacts
+    frame_of_reference : str
+        Hash of the frame of reference of a DICOM series; empty of other files. Never to be stored.
     """
 
     volume: CtVolume
@@ -84,6 +86,7 @@ class CtScan:
     set_aside: tuple[tuple[str, str], ...] = ()
     laterality: str | None = None
     facts: CtFacts = CtFacts()
+    frame_of_reference: str = ""
 
 
 def _read_nifti(data: bytes, file: str) -> tuple[ForeignImage, tuple[float, float]]:

@@ -11,13 +11,15 @@ import hashlib
 import io
 import logging
 import re
+import secrets
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+
+from pipeline.files.dicom_tags import PARSE_ERRORS, Tags
 
 #: Largest file whose header is read; an enhanced CT of a whole body is smaller.
 MAX_FILE_BYTES = 2_000_000_000
@@ -35,6 +37,7 @@ DEFLATED = "1.2.840.10008.1.2.1.99"
 #: SOP classes that hold CT: one slice a file, enhanced, legacy converted enhanced.
 CT_SLICE = "1.2.840.10008.5.1.4.1.1.2"
 ENHANCED_CT = ("1.2.840.10008.5.1.4.1.1.2.1", "1.2.840.10008.5.1.4.1.1.2.2")
+CT_CLASSES = (CT_SLICE, *ENHANCED_CT)
 
 _LOSSY = ("1.2.840.10008.1.2.4.81", "1.2.840.10008.1.2.4.91")
 _PREAMBLE = 128
@@ -42,10 +45,8 @@ _MAX_META_BYTES = 100_000
 _LONG_VRS = (b"OB", b"OW", b"OF", b"OD", b"OL", b"OV", b"SQ", b"UC", b"UN", b"UR", b"UT", b"SV", b"UV")
 _UNDEFINED = 0xFFFFFFFF
 _ITEM, _END_OF_ITEMS = b"\xfe\xff\x00\xe0", b"\xfe\xff\xdd\xe0"
-_DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
-_INTEGER = re.compile(r"[+-]?[0-9]{1,10}")
-_WORD = re.compile(r"[A-Za-z0-9_ ./+-]{1,32}")
-_PARSE_ERRORS = (ArithmeticError, AttributeError, EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError)
+#: Two UIDs can be compared within one run and told by nobody after it.
+_RUN_SALT = secrets.token_bytes(16)
 
 
 class Fault(StrEnum):
@@ -91,6 +92,8 @@ class DicomHeader:
         Between rows (along a column), between columns, mm.
     orientation, position : tuple of 6, 3 floats
         ImageOrientationPatient, ImagePositionPatient (mm), LPS.
+    instance, declared_images : int or None
+        InstanceNumber; how many images the series or the acquisition says it has.
     padding : tuple of 2 ints
         Lowest and highest stored value that stands for "nothing here".
     pixels : (int, int)
@@ -132,6 +135,8 @@ class DicomHeader:
     slice_thickness_mm: float | None
     tilt_deg: float | None
     lossy: bool
+    instance: int | None
+    declared_images: int | None
     pixels: tuple[int, int]
     faults: tuple[tuple[str, str], ...]
 
@@ -166,6 +171,29 @@ def read_header(data: bytes, file: str, salt: bytes = b"") -> DicomHeader | Unre
     DicomHeader or Unread
         Never raises for what is in the file. Of a CT the pixels are there to their last byte.
     """
+    found = open_dicom(data, file, salt)
+    return found.header if isinstance(found, DicomFile) else found
+
+
+def open_dicom(data: bytes, file: str, salt: bytes = b"", classes: Collection[str] = CT_CLASSES) -> DicomFile | Unread:
+    """Read the header of one DICOM file and keep the data set it came from, without its pixels.
+
+    Parameters
+    ----------
+    data : bytes
+        The whole file.
+    file : str
+        Its name relative to the case folder, for messages.
+    salt : bytes
+        Goes into the hash that stands for the patient.
+    classes : collection of str
+        SOP classes that are asked for; a file of another one that is encoded in an unread way is another object.
+
+    Returns
+    -------
+    DicomFile or Unread
+        Never raises for what is in the file.
+    """
     if len(data) > MAX_FILE_BYTES:
         return Unread(
             file, Fault.TOO_LARGE, f"has {len(data) / 1e9:.1f} GB, expected at most {MAX_FILE_BYTES / 1e9:.0f}"
@@ -178,10 +206,15 @@ def read_header(data: bytes, file: str, salt: bytes = b"") -> DicomHeader | Unre
         return Unread(file, Fault.DAMAGED, "ends or is broken in its first part, the file meta information")
     syntax, sop_class = meta[0x0010], meta.get(0x0002, "")
     if syntax not in SYNTAXES:
-        if sop_class and sop_class != CT_SLICE and sop_class not in ENHANCED_CT:
-            return Unread(file, Fault.OTHER_OBJECT, "is no CT image")
+        if sop_class and sop_class not in classes:
+            return Unread(file, Fault.OTHER_OBJECT, "is another kind of DICOM object")
         return Unread(file, Fault.COMPRESSION, _unread_syntax(syntax))
     return _read_data_set(data, _Source(file, syntax, sop_class, salt))
+
+
+def frame_hash(frame_uid: str) -> str:
+    """What stands for a frame of reference: equal for equal UIDs within one run; empty for none. Never to be stored."""
+    return hashlib.sha256(_RUN_SALT + frame_uid.encode()).hexdigest() if frame_uid else ""
 
 
 @dataclass(frozen=True)
@@ -216,98 +249,36 @@ def _file_meta(data: bytes) -> dict[int, str] | None:
     return out
 
 
-def _read_data_set(data: bytes, source: _Source) -> DicomHeader | Unread:
+def _read_data_set(data: bytes, source: _Source) -> DicomFile | Unread:
     from pydicom import dcmread  # noqa: PLC0415 - a third of a second that only a DICOM case pays
     from pydicom.errors import InvalidDicomError  # noqa: PLC0415 - as above
 
     stream = io.BytesIO(data)
     try:
         with silent_pydicom():
-            tags = _Tags(dcmread(stream, stop_before_pixels=True, force=False))
+            tags = Tags(dcmread(stream, stop_before_pixels=True, force=False))
             header = _header(tags, source, data, stream.tell())
-    except (*_PARSE_ERRORS, InvalidDicomError, struct.error):
+    except (*PARSE_ERRORS, InvalidDicomError):
         return Unread(source.file, Fault.DAMAGED, "has a header that cannot be read to its end")
-    return header
+    return header if isinstance(header, Unread) else DicomFile(header, tags)
 
 
-class _Tags:
-    """Raw values of the top level of a data set; remembers what was there and could not be used."""
+@dataclass(frozen=True, eq=False)
+class DicomFile:
+    """A DICOM file that was read up to its pixels.
 
-    def __init__(self, dataset: Any) -> None:
-        self._dataset = dataset
-        self.faults: dict[str, str] = {}
+    Attributes
+    ----------
+    header : DicomHeader
+    tags : Tags
+        Of the top level.
+    """
 
-    def raw(self, keyword: str) -> bytes:
-        """The bytes of an element; empty when it is absent."""
-        from pydicom.dataelem import RawDataElement  # noqa: PLC0415 - as in _read_data_set
-
-        if keyword not in self._dataset:
-            return b""
-        element = self._dataset.get_item(keyword)
-        if not isinstance(element, RawDataElement):
-            self.faults[keyword] = "is not of its kind"
-            return b""
-        return bytes(element.value or b"")
-
-    def texts(self, keyword: str) -> tuple[str, ...]:
-        """The values of a text element without padding; empty when it is absent."""
-        raw = self.raw(keyword).decode("latin-1").strip(" \0")
-        return tuple(text.strip(" \0") for text in raw.split("\\")) if raw else ()
-
-    def text(self, keyword: str) -> str:
-        """The first value of a text element that is a plain word, else empty."""
-        first = (*self.texts(keyword), "")[0]
-        return first if _WORD.fullmatch(first) else ""
-
-    def decimals(self, keyword: str, count: int) -> tuple[float, ...] | None:
-        """Exactly ``count`` finite numbers; None otherwise."""
-        texts = self.texts(keyword)
-        if not texts:
-            return None
-        if len(texts) != count or not all(_DECIMAL.fullmatch(text) for text in texts):
-            self.faults[keyword] = "is not a number" if count == 1 else f"is not {count} numbers"
-            return None
-        numbers = tuple(float(text) for text in texts)
-        if not all(abs(number) < 1e300 for number in numbers):
-            self.faults[keyword] = "is not finite"
-            return None
-        return numbers
-
-    def decimal(self, keyword: str) -> float | None:
-        """One finite number, or None."""
-        numbers = self.decimals(keyword, 1)
-        return None if numbers is None else numbers[0]
-
-    def short(self, keyword: str, *, signed: bool = False) -> int | None:
-        """One number of 16 bits, or None."""
-        if not (raw := self.raw(keyword)):
-            return None
-        if len(raw) != 2:
-            self.faults[keyword] = "is not one number"
-            return None
-        little = self._dataset.get_item(keyword).is_little_endian
-        return int.from_bytes(raw, "little" if little else "big", signed=signed)
-
-    def flag(self, keyword: str) -> bool | None:
-        """A number that is 0 or 1, or None."""
-        number = self.short(keyword)
-        if number not in (None, 0, 1):
-            self.faults[keyword] = "is neither 0 nor 1"
-            return None
-        return None if number is None else bool(number)
-
-    def frames(self) -> int | None:
-        """NumberOfFrames, 1 where it is absent, None where it is no number."""
-        texts = self.texts("NumberOfFrames")
-        if not texts:
-            return 1
-        if len(texts) != 1 or not _INTEGER.fullmatch(texts[0]):
-            self.faults["NumberOfFrames"] = "is not a whole number"
-            return None
-        return int(texts[0])
+    header: DicomHeader
+    tags: Tags
 
 
-def _header(tags: _Tags, source: _Source, data: bytes, pixels_at: int) -> DicomHeader | Unread:
+def _header(tags: Tags, source: _Source, data: bytes, pixels_at: int) -> DicomHeader | Unread:
     sop_class = "".join(tags.texts("SOPClassUID")[:1]) or source.sop_class
     modality = tags.text("Modality")
     pixels = _pixel_range(data, pixels_at, source.syntax)
@@ -348,6 +319,8 @@ def _header(tags: _Tags, source: _Source, data: bytes, pixels_at: int) -> DicomH
         slice_thickness_mm=tags.decimal("SliceThickness"),
         tilt_deg=tags.decimal("GantryDetectorTilt"),
         lossy=source.syntax in _LOSSY or tags.text("LossyImageCompression") == "01",
+        instance=tags.whole("InstanceNumber"),
+        declared_images=tags.whole("NumberOfSeriesRelatedInstances") or tags.whole("ImagesInAcquisition"),
         pixels=pixels or (0, 0),
         faults=tuple(tags.faults.items()),
     )
@@ -366,16 +339,16 @@ def _contradiction(modality: str, sop_class: str, source: _Source, *, has_pixels
     return "" if modality in ("CT", "") else "is a CT image by its class and not by its modality"
 
 
-def _uid(tags: _Tags, keyword: str) -> str:
+def _uid(tags: Tags, keyword: str) -> str:
     return "".join(tags.texts(keyword)[:1])
 
 
-def _patient(tags: _Tags, salt: bytes) -> str:
+def _patient(tags: Tags, salt: bytes) -> str:
     facts = [tags.raw(keyword).strip(b" \0") for keyword in ("PatientID", "PatientName", "PatientBirthDate")]
     return hashlib.sha256(salt + b"\n".join(facts)).hexdigest()
 
 
-def _padding(tags: _Tags, *, signed: bool) -> tuple[int, int] | None:
+def _padding(tags: Tags, *, signed: bool) -> tuple[int, int] | None:
     value = tags.short("PixelPaddingValue", signed=signed)
     if value is None:
         return None

@@ -21,7 +21,16 @@ from numpy.typing import NDArray
 from pipeline.engine.stage import Finding, Severity
 from pipeline.errors import CaseRejected
 from pipeline.files.ct_volumes import CtFacts, CtScan, check_hounsfield
-from pipeline.files.dicom_headers import CT_SLICE, ENHANCED_CT, SYNTAXES, DicomHeader, Fault, Unread, read_header
+from pipeline.files.dicom_headers import (
+    CT_SLICE,
+    ENHANCED_CT,
+    SYNTAXES,
+    DicomHeader,
+    Fault,
+    Unread,
+    frame_hash,
+    read_header,
+)
 from pipeline.files.dicom_pixels import stack_values
 from pipeline.files.dicom_stack import LANDING_MM, Stack, check_stack, in_plane
 from pipeline.files.foreign_image import MAX_VOXELS
@@ -103,7 +112,13 @@ def read_dicom_series(names: Sequence[str], read: Read) -> CtScan:
     volume = in_lps_order(CtVolume(values, stack.lps_from_index))
     _check_landing(volume, stack, values)
     series = f"The CT series ({len(stack.slices)} slices)"
-    findings = (*stack.findings, *_remarks(chosen), *notes, *check_hounsfield(volume.values, series))
+    findings = (
+        *stack.findings,
+        *_remarks(chosen),
+        *_missing_at_an_end(chosen, headers),
+        *notes,
+        *check_hounsfield(volume.values, series),
+    )
     first = stack.slices[0]
     facts = CtFacts(
         first.kvp,
@@ -113,7 +128,14 @@ def read_dicom_series(names: Sequence[str], read: Read) -> CtScan:
         first.tilt_deg,
         any(header.lossy for header in stack.slices),
     )
-    return CtScan(volume, findings, chosen.set_aside, _laterality(stack.slices), facts)
+    return CtScan(
+        volume,
+        findings,
+        chosen.set_aside,
+        _laterality(stack.slices),
+        facts,
+        frame_of_reference=frame_hash(first.frame_uid),
+    )
 
 
 def choose_series(headers: Sequence[DicomHeader], set_aside: Sequence[tuple[str, str]] = ()) -> ChosenSeries:
@@ -366,6 +388,25 @@ def _remarks(chosen: ChosenSeries) -> tuple[Finding, ...]:
         )
         out.append(Finding("W-DCM-01", Severity.REVIEW, text))
     return tuple(out)
+
+
+def _missing_at_an_end(chosen: ChosenSeries, headers: Sequence[DicomHeader]) -> tuple[Finding, ...]:
+    """Signs of slices that never came; inside the series a gap shows, at its ends none does."""
+    series = chosen.slices[0].series_uid
+    mine = {header.sop_uid: header for header in headers if header.series_uid == series}
+    declared = max((header.declared_images or 0 for header in chosen.slices), default=0)
+    if declared > len(mine):
+        text = (
+            f"The CT series says that it has {declared} images, and {len(mine)} are here: slices may be missing at an "
+            "end. Export the series again, and compare the number of its files."
+        )
+        return (Finding("W-DCM-03", Severity.REVIEW, text),)
+    numbers = [header.instance for header in mine.values()]
+    known = [number for number in numbers if number is not None]
+    if len(known) < len(numbers) or min(known, default=1) <= 1:
+        return ()
+    text = f"The images of the CT series are numbered from {min(known)} on; {min(known) - 1} may be missing at an end."
+    return (Finding("N-DCM-05", Severity.NOTE, text),)
 
 
 def _laterality(slices: Sequence[DicomHeader]) -> str | None:

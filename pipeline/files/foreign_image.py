@@ -43,12 +43,18 @@ class ForeignImage:
         Segment name -> label value where the file names them (``.seg.nrrd``), else empty.
     findings : tuple of Finding
         What the reader had to assume.
+    side : str
+        ``right`` or ``left`` where the codes of the segments say so, else empty.
+    frame_of_reference : str
+        Stands for the space that the file lies in, to be compared within one run only; empty where it names none.
     """
 
     values: NDArray[Any]
     lps_from_index: NDArray[np.float64]
     segments: Mapping[str, int] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
+    side: str = ""
+    frame_of_reference: str = ""
 
 
 @dataclass(frozen=True)
@@ -110,6 +116,15 @@ def wrong_unit(file: str, unit: str) -> CaseRejected:
         "E-GEO-05",
         f"{file} gives its lengths in {unit}, expected millimetres.",
         "Export it again in millimetres; programs disagree on how to convert this.",
+    )
+
+
+def not_labels(file: str, problem: str) -> CaseRejected:
+    """E-LBL-02: a volume of something else than labels."""
+    return CaseRejected(
+        "E-LBL-02",
+        f"{file} is not a label map: {problem}.",
+        "Give the segmentation (one whole number for each structure), not the CT itself.",
     )
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.engine.stage import Finding, Severity
 from pipeline.errors import CaseRejected
-from pipeline.files.foreign_image import ForeignImage, not_finite, unsupported
+from pipeline.files.foreign_image import ForeignImage, not_finite, not_labels, unsupported
 from pipeline.files.metaimage_format import read_metaimage
 from pipeline.files.nrrd_format import read_nrrd
 from pipeline.geometry.volume import LabelVolume, axis_codes, in_lps_order, label_counts, shear
@@ -40,18 +40,23 @@ def _read_nifti(data: bytes, file: str) -> ForeignImage:
     return read_nifti(data, file)
 
 
+def _read_dicom_seg(data: bytes, file: str) -> ForeignImage:
+    from pipeline.files.dicom_seg import read_dicom_seg  # noqa: PLC0415 - as above, for a file that is seldom given
+
+    return read_dicom_seg(data, file)
+
+
 _READERS: dict[str, Callable[[bytes, str], ForeignImage]] = {
     ".nii": _read_nifti,
     ".nii.gz": _read_nifti,
     ".nrrd": read_nrrd,
     ".mha": read_metaimage,
+    ".dcm": _read_dicom_seg,
 }
 #: File name endings of label maps that are read (``.seg.nrrd`` is a ``.nrrd``).
 LABEL_MAP_ENDINGS = tuple(_READERS)
 #: Headers whose voxels lie in another file: refused, since such a header can name any file of the machine.
 DETACHED_ENDINGS = (".mhd", ".nhdr", ".hdr", ".img")
-
-_NOT_A_LABEL_MAP = "Give the segmentation (one whole number for each structure), not the CT itself."
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +73,16 @@ class LabelMap:
         Voxels of each label value.
     findings : tuple of Finding
         What was assumed or changed.
+    side, frame_of_reference : str
+        As in :class:`ForeignImage`; empty where the file does not say.
     """
 
     volume: LabelVolume
     segments: Mapping[str, int]
     counts: NDArray[np.int64]
     findings: tuple[Finding, ...]
+    side: str = ""
+    frame_of_reference: str = ""
 
 
 def read_label_map(data: bytes, file: str) -> LabelMap:
@@ -95,9 +104,43 @@ def read_label_map(data: bytes, file: str) -> LabelMap:
     check_geometry(image.lps_from_index, image.values.shape, file)
     values, notes = label_values(image.values, file)
     if (found := int(np.count_nonzero(counts := label_counts(values)))) > MAX_LABELS:
-        raise _not_labels(file, f"it has {found} different values, expected at most {MAX_LABELS}")
+        raise not_labels(file, f"it has {found} different values, expected at most {MAX_LABELS}")
     volume = in_lps_order(LabelVolume(values, image.lps_from_index))
-    return LabelMap(volume, image.segments, counts, (*image.findings, *handedness(image, file), *notes))
+    findings = (*image.findings, *handedness(image, file), *notes)
+    return LabelMap(volume, image.segments, counts, findings, image.side, image.frame_of_reference)
+
+
+def check_belongs(label_map: LabelMap, file: str, side: str, frame_of_reference: str) -> None:
+    """Refuse a label map that says it is of the other leg, or of another scan than the CT beside it.
+
+    Parameters
+    ----------
+    label_map : LabelMap
+    file : str
+        For messages.
+    side : str
+        As the case declares it.
+    frame_of_reference : str
+        Of the CT, as :func:`pipeline.files.dicom_headers.frame_hash` has it; empty where there is none.
+
+    Raises
+    ------
+    CaseRejected
+        E-SIDE-04, E-GEO-08.
+    """
+    if label_map.side not in ("", side):
+        raise CaseRejected(
+            "E-SIDE-04",
+            f"The case is declared {side}, and the segments of {file} are coded as {label_map.side}.",
+            "Correct 'side:' in case.yaml, or give the segmentation of the other leg.",
+        )
+    frames = {label_map.frame_of_reference, frame_of_reference} - {""}
+    if len(frames) > 1:
+        raise CaseRejected(
+            "E-GEO-08",
+            f"{file} does not belong to the CT of the case: it names another frame of reference.",
+            "Give the segmentation that was drawn on this CT series, or the series that it was drawn on.",
+        )
 
 
 def check_geometry(lps_from_index: NDArray[np.float64], shape: tuple[int, ...], file: str) -> None:
@@ -135,10 +178,10 @@ def label_values(values: NDArray[Any], file: str) -> tuple[NDArray[np.uint16], t
     """
     low, high = values.min(), values.max()
     if not (low >= 0 and high <= MAX_VALUE):  # also false for NaN
-        raise _not_labels(file, f"it has values from {low:g} to {high:g}, expected 0 to {MAX_VALUE}")
+        raise not_labels(file, f"it has values from {low:g} to {high:g}, expected 0 to {MAX_VALUE}")
     labels = values.astype(np.uint16)
     if values.dtype.kind == "f" and not np.array_equal(labels, values):
-        raise _not_labels(file, "it has fractions, expected whole numbers")
+        raise not_labels(file, "it has fractions, expected whole numbers")
     if values.dtype.kind == "f":
         text = f"{file} stores its labels as {values.dtype.name}; all are whole numbers and were taken as such."
         return labels, (Finding("N-LBL-02", Severity.NOTE, text),)
@@ -181,7 +224,3 @@ def _outside(actual_mm: NDArray[np.float64], limits_mm: tuple[float, float]) -> 
     guess = "metres" if actual_mm.max() < high / 500 else "micrometres" if actual_mm.min() > low * 500 else ""
     lengths = " x ".join(f"{x:.4g}" for x in actual_mm)
     return f"{lengths} mm, expected {low:g} to {high:g} mm" + (f" (it looks like {guess})" if guess else "")
-
-
-def _not_labels(file: str, problem: str) -> CaseRejected:
-    return CaseRejected("E-LBL-02", f"{file} is not a label map: {problem}.", _NOT_A_LABEL_MAP)

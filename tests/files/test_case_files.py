@@ -12,11 +12,21 @@ from pipeline.errors import CaseRejected
 from pipeline.files import case_files
 from pipeline.files.case_files import choose_files, read_file
 
-OTHERS = ["case.yaml", "labels.json", "notes/labels.nrrd", "meshes/readme.txt", "ctlike.nii.gz"]
+OTHERS = ["case.yaml", "labels.json", "notes/labels.nrrd", "scout.dcm", "meshes/readme.txt", "ctlike.nii.gz"]
 
 
 @pytest.mark.parametrize(
-    "name", ["labels.nii.gz", "labels.nii", "labels.nrrd", "LABELS.MHA", "labels.seg.nrrd", "P1.seg.nrrd"]
+    "name",
+    [
+        "labels.nii.gz",
+        "labels.nii",
+        "labels.nrrd",
+        "LABELS.MHA",
+        "labels.seg.nrrd",
+        "P1.seg.nrrd",
+        "labels.dcm",
+        "P1.SEG.dcm",
+    ],
 )
 def test_one_label_map(name: str) -> None:
     chosen = choose_files([*OTHERS, name])
@@ -47,6 +57,7 @@ def test_ligaments(name: str) -> None:
     assert chosen.names == ("labels.nrrd", name)
 
 
+@pytest.mark.fault("V02")
 @pytest.mark.parametrize(
     ("names", "code", "problem"),
     [
@@ -55,6 +66,7 @@ def test_ligaments(name: str) -> None:
         (["ct.nii.gz", "CT.MHA"], "E-IO-16", r"more than one CT: CT\.MHA, ct\.nii\.gz"),
         ([], "E-IO-15", "no files"),
         (["labels.nii", "labels.nii.gz"], "E-IO-16", r"more than one segmentation: labels\.nii, labels\.nii\.gz"),
+        (["labels.nii", "a.seg.dcm"], "E-IO-16", r"a\.seg\.dcm, labels\.nii"),
         (["labels.nii", "a.seg.nrrd"], "E-IO-16", r"a\.seg\.nrrd, labels\.nii"),
         (["labels.nii", "meshes/femur.ply"], "E-IO-16", r"labels\.nii, meshes/femur\.ply"),
         (["labels.nii", "a.fcsv", "b.mrk.json"], "E-IO-16", r"landmark file: a\.fcsv, b\.mrk\.json"),

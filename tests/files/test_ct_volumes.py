@@ -135,6 +135,7 @@ def scaled_header(slope: float, intercept: float) -> bytes:
     return bytes(header.binaryblock) + raw[348:]
 
 
+@pytest.mark.fault("V01")
 @each_format
 def test_cut_anywhere(name: str, tmp_path: Path) -> None:
     data = FORMATS[name](LEG.values, tmp_path)
@@ -144,6 +145,7 @@ def test_cut_anywhere(name: str, tmp_path: Path) -> None:
         assert "label" not in str(caught.value)
 
 
+@pytest.mark.fault("V06")
 def test_a_mirrored_storage_is_put_right() -> None:
     matrix = LEG.lps_from_index.copy()
     matrix[:3, 3] += matrix[:3, 0] * 23
@@ -153,6 +155,7 @@ def test_a_mirrored_storage_is_put_right() -> None:
     assert codes(found) == ["N-GEO-01"]
 
 
+@pytest.mark.fault("V03", "V05", "V07", "V08")
 @pytest.mark.parametrize(
     ("axes", "code"),
     [
@@ -176,6 +179,7 @@ def test_formats_that_are_not_read(name: str) -> None:
         read_ct_volume(b"", name)
 
 
+@pytest.mark.fault("V09")
 def test_more_than_one_volume() -> None:
     with refused("E-CT-01", "not one 3-D volume"):
         read_ct_volume(nifti(np.stack([LEG.values] * 2, axis=-1)), "ct.nii")
@@ -207,6 +211,7 @@ def test_a_lost_scale_has_no_air() -> None:
     assert codes(found) == ["W-CT-01"]
 
 
+@pytest.mark.fault("V20")
 def test_metal() -> None:
     values = LEG.values.copy()
     values[9:13, 7:11, 2:8] = 3071

@@ -35,7 +35,8 @@ FILES = series()
 MIDDLE, LAST = "IM0006.dcm", "IM0012.dcm"
 
 
-def test_padding_becomes_air() -> None:  # D15
+@pytest.mark.fault("D15")
+def test_padding_becomes_air() -> None:
     rim = LEG.values.copy()
     rim[0] = -3024
     expected = LEG.values.copy()
@@ -46,7 +47,8 @@ def test_padding_becomes_air() -> None:  # D15
     assert codes(found) == ["N-DCM-02"]
 
 
-def test_padding_far_outside_of_the_scale() -> None:  # D15
+@pytest.mark.fault("D15")
+def test_padding_far_outside_of_the_scale() -> None:
     rim = LEG.values.copy()
     rim[0] = -30_000
     files = encode_series(CtVolume(rim, LEG.lps_from_index))
@@ -81,7 +83,8 @@ def test_a_slope_with_fractions() -> None:
     assert codes(found) == ["N-CT-01"]
 
 
-def test_near_lossless_pixels_are_looked_at() -> None:  # D16
+@pytest.mark.fault("D16")
+def test_near_lossless_pixels_are_looked_at() -> None:
     files = {}
     for name, data in FILES.items():
         dataset = dcmread(io.BytesIO(data))
@@ -92,15 +95,17 @@ def test_near_lossless_pixels_are_looked_at() -> None:  # D16
     assert codes(found) == ["W-DCM-01"]
 
 
-def test_lossy_pixels_are_looked_at() -> None:  # D16
+@pytest.mark.fault("D16")
+def test_lossy_pixels_are_looked_at() -> None:
     found = read(with_edited(FILES, {"LossyImageCompression": b"01"}))
     assert_same(found, LEG)
     assert codes(found) == ["W-DCM-01"]
     assert found.facts.lossy
 
 
+@pytest.mark.fault("D16")
 @pytest.mark.parametrize("rate", [2.0, 5.0])
-def test_lossy_jpeg_2000_is_read_and_looked_at(rate: float) -> None:  # D16
+def test_lossy_jpeg_2000_is_read_and_looked_at(rate: float) -> None:
     """Pictures that another library wrote with loss: what it reads itself, not the truth, and said to be lossy."""
     files, shown = {}, []
     for name, data in series(SeriesSpec(signed=False)).items():
@@ -125,7 +130,8 @@ def lossy(data: bytes, rate: float) -> tuple[bytes, NDArray[np.uint16]]:
     return written(dataset), np.asarray(Image.open(out), dtype=np.uint16)
 
 
-def test_one_voxel_too_bright() -> None:  # D19
+@pytest.mark.fault("D19")
+def test_one_voxel_too_bright() -> None:
     values = LEG.values.copy()
     values[10, 8, 5] = 31_000
     assert codes(read(encode_series(CtVolume(values, LEG.lps_from_index)))) == ["W-CT-02"]
@@ -153,7 +159,8 @@ def test_cut_inside_the_frame(syntax: str) -> None:
     assert refusals
 
 
-def test_a_compressed_frame_of_another_size() -> None:  # D21
+@pytest.mark.fault("D21")
+def test_a_compressed_frame_of_another_size() -> None:
     for syntax in ("JPEG lossless", "JPEG-LS lossless", "JPEG 2000 lossless", "RLE"):
         with refused("E-IO-11", "cannot be decoded to 24 x 40"):
             read(with_edited(series(SeriesSpec(syntax=syntax)), {"Rows": short(40)}))

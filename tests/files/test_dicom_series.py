@@ -49,6 +49,7 @@ MIDDLE, LAST = "IM0006.dcm", "IM0012.dcm"
 # what is accepted
 
 
+@pytest.mark.fault("D16")
 @pytest.mark.parametrize("syntax", TRANSFER_SYNTAXES)
 @pytest.mark.parametrize("signed", [True, False])
 def test_every_syntax_gives_the_same_volume(syntax: str, *, signed: bool) -> None:
@@ -58,6 +59,7 @@ def test_every_syntax_gives_the_same_volume(syntax: str, *, signed: bool) -> Non
     assert (found.findings, found.set_aside, found.laterality) == ((), (), None)
 
 
+@pytest.mark.fault("D10")
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
 @pytest.mark.parametrize("flips", list(itertools.product((False, True), repeat=3)))
 def test_every_orientation_gives_the_same_volume(order: tuple[int, int, int], flips: tuple[bool, ...]) -> None:
@@ -73,6 +75,7 @@ def test_every_orientation_gives_the_same_volume(order: tuple[int, int, int], fl
     assert found.findings == ()
 
 
+@pytest.mark.fault("D10")
 @pytest.mark.parametrize("angles", [(30.0, 20.0), (-75.0, 10.0), (3.0, 44.0)])
 def test_any_oblique_stack_lands_where_its_headers_say(angles: tuple[float, float]) -> None:
     matrix = LEG.lps_from_index.copy()
@@ -110,7 +113,9 @@ def test_a_real_series() -> None:
     assert found.volume.values.shape == (512, 512, 20)
     np.testing.assert_allclose(found.volume.lps_from_index[:3, 3], (0.0, 0.0, 100.0))
     assert (found.volume.values.min(), found.volume.values.max()) == (-1024, 1427)
-    assert (found.findings, found.set_aside) == ((), ())
+    assert found.set_aside == ()
+    assert codes(found) == ["N-DCM-05"]
+    assert "numbered from 101 on" in found.findings[0].message  # it is a part of a longer series
     with refused("E-DCM-09", r"1 slices are missing .*\(0, 0, 109\) mm .*\(0, 0, 111\) mm"):
         read({name: data for name, data in files.items() if "_111" not in name})
 
@@ -118,21 +123,24 @@ def test_a_real_series() -> None:
 # what is set aside
 
 
-def test_identical_copies_are_set_aside() -> None:  # D03
+@pytest.mark.fault("D03")
+def test_identical_copies_are_set_aside() -> None:
     found = read({**FILES, "copy/IM0006.dcm": FILES[MIDDLE]})
     assert_same(found, LEG)
     assert found.set_aside == (("copy/IM0006.dcm", "copy of IM0006.dcm"),)
     assert codes(found) == ["N-DCM-01"]
 
 
+@pytest.mark.fault("D06")
 @pytest.mark.parametrize(("localizer", "size"), [(True, 20), (True, 33), (False, 20), (False, 33)])
-def test_scouts_are_set_aside(size: int, *, localizer: bool) -> None:  # D06
+def test_scouts_are_set_aside(size: int, *, localizer: bool) -> None:
     found = read({**FILES, "IM0000.dcm": scout(FILES, localizer=localizer, size=size)})
     assert_same(found, LEG)
     assert [file for file, why in found.set_aside if "localiser" in why] == ["IM0000.dcm"]
 
 
-def test_junk_is_set_aside() -> None:  # D24
+@pytest.mark.fault("D24")
+def test_junk_is_set_aside() -> None:
     junk = {
         "Thumbs.db": b"\xd0\xcf\x11\xe0",
         ".DS_Store": b"\0\0\0\1Bud1",
@@ -151,6 +159,7 @@ def test_junk_is_set_aside() -> None:  # D24
     assert codes(found) == ["N-DCM-01"]
 
 
+@pytest.mark.fault("D24", "D30")
 @pytest.mark.parametrize(
     ("files", "problem"),
     [
@@ -160,7 +169,7 @@ def test_junk_is_set_aside() -> None:  # D24
         ({"a.dcm": other_object(FILES, "MR", "1.2.840.10008.5.1.4.1.1.4")}, "modality MR, not CT"),
     ],
 )
-def test_nothing_to_read(files: Files, problem: str) -> None:  # D24, D30
+def test_nothing_to_read(files: Files, problem: str) -> None:
     with refused("E-DCM-01", problem):
         read(files)
 
@@ -168,7 +177,8 @@ def test_nothing_to_read(files: Files, problem: str) -> None:  # D24, D30
 # which series
 
 
-def test_two_series_are_listed() -> None:  # D05
+@pytest.mark.fault("D05")
+def test_two_series_are_listed() -> None:
     other = {f"other/{name}": data for name, data in list(series(SeriesSpec(seed="b")).items())[:5]}
     with refused("E-DCM-03", "more than one study: 12 slices with IM0001.dcm, 5 slices with other/IM0001.dcm"):
         read({**FILES, **other})
@@ -178,7 +188,8 @@ def test_two_series_are_listed() -> None:  # D05
         read(same_study)
 
 
-def test_two_patients_under_one_series() -> None:  # D07
+@pytest.mark.fault("D07")
+def test_two_patients_under_one_series() -> None:
     names = [f"IM{n:04d}.dcm" for n in range(1, 7)]
     with refused("E-DCM-02", "more than one patient: 6 slices with IM0001.dcm, 6 slices with IM0007.dcm") as caught:
         read(with_edited(FILES, {"PatientID": b"CANARY7", "PatientName": b"Canary^Eve"}, *names))
@@ -192,6 +203,30 @@ def test_two_frames_of_reference() -> None:
         read(with_edited(FILES, {"FrameOfReferenceUID": b"1.2.3.4"}, MIDDLE))
 
 
+@pytest.mark.fault("D02")
+def test_slices_that_are_missing_at_an_end() -> None:
+    cut = without(FILES, "IM0001.dcm", "IM0002.dcm")
+    assert codes(read(cut)) == ["N-DCM-05"]
+    assert "numbered from 3 on; 2 may be missing" in read(cut).findings[0].message
+    for keyword in ("ImagesInAcquisition", "NumberOfSeriesRelatedInstances"):
+        told = with_edited(FILES, {keyword: b"12"})
+        assert codes(read(told)) == []
+        for lost in ("IM0001.dcm", LAST):
+            found = read(without(told, lost))
+            assert codes(found) == ["W-DCM-03"]
+            assert "says that it has 12 images, and 11 are here" in found.findings[0].message
+
+
+def test_numbers_that_a_scout_or_nobody_has_taken() -> None:
+    numbered = {
+        name: edited(data, {"InstanceNumber": str(n).encode()}) for n, (name, data) in enumerate(FILES.items(), 2)
+    }
+    assert codes(read(numbered)) == ["N-DCM-05"]
+    overview = edited(scout(FILES, localizer=True), {"InstanceNumber": b"1"})
+    assert codes(read({**numbered, "IM0000.dcm": overview})) == ["N-DCM-01"]
+    assert codes(read(with_edited(FILES, {"InstanceNumber": None}))) == []
+
+
 def test_too_few_slices() -> None:
     with refused("E-DCM-15", "2 slices"):
         read(dict(list(FILES.items())[:2]))
@@ -200,6 +235,7 @@ def test_too_few_slices() -> None:
 # tags
 
 
+@pytest.mark.fault("D11", "D12")
 @pytest.mark.parametrize(
     ("keyword", "value", "code", "problem"),
     [
@@ -226,17 +262,19 @@ def test_too_few_slices() -> None:
         ("RescaleIntercept", b"1e30", "E-DCM-12", "1e\\+30"),
     ],
 )
-def test_tags_that_cannot_be_meant(keyword: str, value: bytes | None, code: str, problem: str) -> None:  # D11, D12
+def test_tags_that_cannot_be_meant(keyword: str, value: bytes | None, code: str, problem: str) -> None:
     with refused(code, problem):
         read(with_edited(FILES, {keyword: value}, MIDDLE))
 
 
+@pytest.mark.fault("D12")
 @pytest.mark.parametrize("value", [None, b"0", b"NaN", b"1e30"])
-def test_a_rescale_that_no_slice_has(value: bytes | None) -> None:  # D12
+def test_a_rescale_that_no_slice_has(value: bytes | None) -> None:
     with refused("E-DCM-12", "RescaleSlope of IM0001.dcm"):
         read(with_edited(FILES, {"RescaleSlope": value}))
 
 
+@pytest.mark.fault("D14")
 @pytest.mark.parametrize(
     ("tags", "code", "problem"),
     [
@@ -251,12 +289,13 @@ def test_a_rescale_that_no_slice_has(value: bytes | None) -> None:  # D12
         ({"NumberOfFrames": b"3"}, "E-DCM-05", "multi-frame image of 3 frames"),
     ],
 )
-def test_pixels_of_another_kind(tags: dict[str, bytes | None], code: str, problem: str) -> None:  # D14
+def test_pixels_of_another_kind(tags: dict[str, bytes | None], code: str, problem: str) -> None:
     with refused(code, problem):
         read(with_edited(FILES, tags))
 
 
-def test_enhanced_ct_is_refused_by_its_name() -> None:  # D27
+@pytest.mark.fault("D27")
+def test_enhanced_ct_is_refused_by_its_name() -> None:
     with refused("E-DCM-05", "enhanced multi-frame CT"):
         read({"scan.dcm": enhanced(FILES)})
     with refused("E-DCM-05", "enhanced multi-frame CT"):
@@ -266,9 +305,10 @@ def test_enhanced_ct_is_refused_by_its_name() -> None:  # D27
 # damaged files
 
 
+@pytest.mark.fault("D18")
 @pytest.mark.parametrize("syntax", ["explicit little endian", "implicit little endian", "JPEG-LS lossless", "RLE"])
 @pytest.mark.parametrize("name", [MIDDLE, LAST])
-def test_cut_anywhere(syntax: str, name: str) -> None:  # D18: the last slice too, which no gap would tell
+def test_cut_anywhere(syntax: str, name: str) -> None:  # the last slice too, which no gap would tell
     files = series(SeriesSpec(syntax=syntax))
     whole = files[name]
     for part in range(64):
@@ -276,14 +316,16 @@ def test_cut_anywhere(syntax: str, name: str) -> None:  # D18: the last slice to
             read({**files, name: whole[: len(whole) * part // 64]})
 
 
+@pytest.mark.fault("D18")
 @pytest.mark.parametrize("data", [b"", FILES[LAST][:128], FILES[LAST][:132], b"<html>404</html>" * 99])
-def test_no_dicom_where_a_slice_should_be(data: bytes) -> None:  # D18
+def test_no_dicom_where_a_slice_should_be(data: bytes) -> None:
     for name in (LAST, "IM0012", "12.IMA"):
         with refused("E-IO-11", f"{name} is damaged or no DICOM file"):
             read({**without(FILES, LAST), name: data})
 
 
-def test_flipped_bits_of_one_header() -> None:  # D20
+@pytest.mark.fault("D20")
+def test_flipped_bits_of_one_header() -> None:
     """Every third byte before the pixels of the end slice: refused, or the volume is the same to 0.1 mm."""
     begin = headers_of({LAST: FILES[LAST]})[0].pixels[0]
     bits = np.random.default_rng(3).integers(0, 8, begin)
@@ -301,16 +343,19 @@ def test_flipped_bits_of_one_header() -> None:  # D20
     assert refusals > 100
 
 
-def test_a_deflated_slice() -> None:  # D17
+@pytest.mark.fault("D17")
+def test_a_deflated_slice() -> None:
     with refused("E-DCM-04", "deflated"):
         read({**FILES, MIDDLE: deflated(FILES[MIDDLE])})
 
 
-def test_a_program_in_the_preamble() -> None:  # D29
+@pytest.mark.fault("D29")
+def test_a_program_in_the_preamble() -> None:
     assert_same(read({name: b"\x7fELF" * 32 + data[128:] for name, data in FILES.items()}), LEG)
 
 
-def test_a_file_that_changes_between_the_readings() -> None:  # D26
+@pytest.mark.fault("D26")
+def test_a_file_that_changes_between_the_readings() -> None:
     seen: set[str] = set()
 
     def reading(name: str) -> bytes:
@@ -325,6 +370,7 @@ def test_a_file_that_changes_between_the_readings() -> None:  # D26
 # sizes
 
 
+@pytest.mark.fault("D21")
 @pytest.mark.parametrize(
     ("tags", "code", "problem"),
     [
@@ -337,12 +383,13 @@ def test_a_file_that_changes_between_the_readings() -> None:  # D26
         ({"NumberOfFrames": b"0"}, "E-DCM-07", "NumberOfFrames .* is below 1"),
     ],
 )
-def test_sizes_that_lie(tags: dict[str, bytes | None], code: str, problem: str) -> None:  # D21
+def test_sizes_that_lie(tags: dict[str, bytes | None], code: str, problem: str) -> None:
     with refused(code, problem):
         read(with_edited(FILES, tags))
 
 
-def test_ten_thousand_large_slices_are_refused_by_their_headers() -> None:  # D22
+@pytest.mark.fault("D22")
+def test_ten_thousand_large_slices_are_refused_by_their_headers() -> None:
     plain = headers_of({MIDDLE: FILES[MIDDLE]})[0]
     many = [
         replace(plain, file=f"{n}.dcm", sop_uid=f"1.2.{n}", position=(0.0, 0.0, float(n)), rows=2048, columns=2048)
@@ -352,7 +399,8 @@ def test_ten_thousand_large_slices_are_refused_by_their_headers() -> None:  # D2
         choose_series(many)
 
 
-def test_too_many_files() -> None:  # D22
+@pytest.mark.fault("D22")
+def test_too_many_files() -> None:
     with refused("E-IO-14", f"{MAX_FILES + 1} files"):
         read_dicom_series(["x"] * (MAX_FILES + 1), lambda _: b"")
 
@@ -368,7 +416,8 @@ def test_the_geometry_gate_of_all_volumes(spacing: bytes, code: str) -> None:
 # what must not matter, and what must never happen
 
 
-def test_texts_of_any_kind_have_no_effect(caplog: pytest.LogCaptureFixture) -> None:  # D28
+@pytest.mark.fault("D28")
+def test_texts_of_any_kind_have_no_effect(caplog: pytest.LogCaptureFixture) -> None:
     texts: dict[str, bytes | None] = {
         "SpecificCharacterSet": b"ISO_IR CANARY",
         "PatientName": b"<script>canary</script>\x1b[31m\r\n" + b"canary^" * 1500,

@@ -36,6 +36,7 @@ FILES = series()
 MIDDLE, LAST = "IM0006.dcm", "IM0012.dcm"
 
 
+@pytest.mark.fault("D01")
 @pytest.mark.parametrize(
     ("lost", "neighbours"),
     [
@@ -44,13 +45,14 @@ MIDDLE, LAST = "IM0006.dcm", "IM0012.dcm"
         (("IM0002.dcm",), (1, 3)),
     ],
 )
-def test_missing_slices_are_placed(lost: tuple[str, ...], neighbours: tuple[int, int]) -> None:  # D01
+def test_missing_slices_are_placed(lost: tuple[str, ...], neighbours: tuple[int, int]) -> None:
     places = [re.escape(f"{height(f'IM{n:04d}'):g}) mm") for n in neighbours]
     with refused("E-DCM-09", f"{len(lost)} slices are missing .*{places[0]}.*{places[1]}"):
         read(without(FILES, *lost))
 
 
-def test_the_same_place_twice() -> None:  # D04
+@pytest.mark.fault("D04")
+def test_the_same_place_twice() -> None:
     twice = edited(FILES[MIDDLE], {"SOPInstanceUID": b"1.2.3", "PixelPaddingValue": short(-2000)})
     with refused("E-DCM-10", "two different slices at the same place"):
         read({**FILES, "IM0099.dcm": twice})
@@ -58,42 +60,48 @@ def test_the_same_place_twice() -> None:  # D04
         read({**FILES, "IM0099.dcm": edited(FILES[MIDDLE], {"KVP": b"80"})})
 
 
+@pytest.mark.fault("D08")
 @pytest.mark.parametrize(
     ("mm", "expected"), [(0.0005, []), (0.008, ["N-DCM-04"]), (0.03, ["W-DCM-02"]), (0.09, ["W-DCM-02"])]
 )
-def test_a_little_uneven(mm: float, expected: list[str]) -> None:  # D08
+def test_a_little_uneven(mm: float, expected: list[str]) -> None:
     found = read(at_heights(FILES, {MIDDLE: height(MIDDLE) + mm}))
     assert codes(found) == expected
     np.testing.assert_array_equal(found.volume.values, LEG.values)
     np.testing.assert_allclose(found.volume.lps_from_index, LEG.lps_from_index, atol=1e-6)
 
 
+@pytest.mark.fault("D08")
 @pytest.mark.parametrize("mm", [0.11, -0.2, 0.9, -1.5])
-def test_too_uneven(mm: float) -> None:  # D08
+def test_too_uneven(mm: float) -> None:
     with refused("E-DCM-11", "not evenly spaced"):
         read(at_heights(FILES, {MIDDLE: height(MIDDLE) + mm}))
 
 
-def test_two_pitches() -> None:  # D08
+@pytest.mark.fault("D08")
+def test_two_pitches() -> None:
     heights = {name: height(name) + 2.0 * max(n - 5, 0) for n, name in enumerate(FILES)}
     with refused("E-DCM-11", "gaps from 2 to 4 mm"):
         read(at_heights(FILES, heights))
 
 
-def test_a_slow_drift_is_uneven_too() -> None:  # D08: each gap differs by 2 % only, the middle lies 0.12 mm off
+@pytest.mark.fault("D08")
+def test_a_slow_drift_is_uneven_too() -> None:  # each gap differs by 2 % only, the middle lies 0.12 mm off
     heights = {name: height(name) + 0.04 * max(n - 5, 0) for n, name in enumerate(FILES)}
     with refused("E-DCM-11", "out of place"):
         read(at_heights(FILES, heights))
 
 
+@pytest.mark.fault("D09")
 @pytest.mark.parametrize("degrees", [0.5, 1.0, 2.0, 5.0, 15.0, 30.0])
-def test_tilt_is_refused_with_its_angle(degrees: float) -> None:  # D09
+def test_tilt_is_refused_with_its_angle(degrees: float) -> None:
     with refused("E-GEO-04", f"tilted against their stack by {degrees:g} deg"):
         read(tilted(FILES, degrees))
 
 
+@pytest.mark.fault("D09")
 @pytest.mark.parametrize("degrees", [0.03, 0.1])
-def test_a_small_tilt_of_a_short_stack_is_no_right_angle(degrees: float) -> None:  # D09
+def test_a_small_tilt_of_a_short_stack_is_no_right_angle(degrees: float) -> None:
     with refused("E-GEO-04", f"{degrees:g} deg"):
         read(tilted(FILES, degrees))
 
@@ -107,14 +115,16 @@ def test_a_slice_pushed_sideways() -> None:
         read(with_positions(FILES, {LAST: (0.0, dicom_samples.ORIGIN_MM[1], height(LAST))}))
 
 
+@pytest.mark.fault("D13")
 @pytest.mark.parametrize("thickness", [b"0.5", b"-3", b"NaN", None])
-def test_thickness_and_declared_spacing_are_ignored(thickness: bytes | None) -> None:  # D13
+def test_thickness_and_declared_spacing_are_ignored(thickness: bytes | None) -> None:
     files = with_edited(FILES, {"SliceThickness": thickness})
     assert_same(
         read(with_edited(files, {"SpacingBetweenSlices": b"7", "SliceLocation": b"3", "InstanceNumber": b"1"})), LEG
     )
 
 
+@pytest.mark.fault("D11", "D12")
 @pytest.mark.parametrize(
     ("keyword", "value"),
     [
@@ -124,7 +134,7 @@ def test_thickness_and_declared_spacing_are_ignored(thickness: bytes | None) -> 
         ("RescaleIntercept", b"0"),
     ],
 )
-def test_slices_that_differ(keyword: str, value: bytes) -> None:  # D11, D12
+def test_slices_that_differ(keyword: str, value: bytes) -> None:
     with refused("E-DCM-(13|08)", f"{keyword} of {MIDDLE}"):
         read(with_edited(FILES, {keyword: value}, MIDDLE))
 

@@ -27,11 +27,13 @@ from tests.files.label_samples import (
     segment_keys,
     with_header,
 )
+from tests.files.seg_samples import Described, SegSpec, seg_bytes
 
 DATA = Path(__file__).resolve().parents[3] / "shared/data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="real data not found beside the checkout")
 
 KNEE = knee_like()
+AS_LABEL_MAP = SegSpec("LABELMAP", segments=[Described(f"part {n}") for n in range(1, 8)], omit_empty=False)
 #: Name of the file -> what writes it; float32 headers (NIfTI) round the matrix to 1e-7 of a metre or so.
 WRITERS: dict[str, tuple[str, Callable[[LabelVolume, Path], bytes]]] = {
     "nifti1 gz": ("labels.nii.gz", lambda v, _: nifti_bytes(v)),
@@ -45,6 +47,7 @@ WRITERS: dict[str, tuple[str, Callable[[LabelVolume, Path], bytes]]] = {
     "nrrd itk": ("labels.nrrd", lambda v, folder: itk_bytes(v, folder, "x.nrrd")),
     "seg.nrrd": ("labels.seg.nrrd", lambda v, _: nrrd_bytes(v, segment_keys({"Femur": 5, "Tibia": 6}))),
     "mha": ("labels.mha", lambda v, folder: itk_bytes(v, folder, "x.mha")),
+    "dicom seg": ("labels.dcm", lambda v, _: seg_bytes(v, AS_LABEL_MAP)),
     "mha raw": ("labels.mha", lambda v, folder: itk_bytes(v, folder, "x.mha", compressed=False)),
 }
 
@@ -68,6 +71,7 @@ def test_every_format_gives_the_same_volume(writer: str, tmp_path: Path) -> None
     assert found.findings == ()
 
 
+@pytest.mark.fault("V06")
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
 @pytest.mark.parametrize("flips", list(itertools.product((False, True), repeat=3)))
 def test_every_storage_order_gives_the_same_volume(order: tuple[int, int, int], flips: tuple[bool, bool, bool]) -> None:
@@ -90,6 +94,7 @@ def test_a_mirrored_matrix_mirrors_the_anatomy() -> None:
     np.testing.assert_allclose(place, expected * (-1.0, 1.0, 1.0), atol=1e-9)
 
 
+@pytest.mark.fault("V10")
 @pytest.mark.parametrize("dtype", [np.int16, np.uint16, np.int32, np.int64, np.float32, np.float64, ">i2", ">f4"])
 def test_whole_numbers_of_any_type(dtype: str) -> None:
     typed = LabelVolume(np.asarray(KNEE.values).astype(dtype), KNEE.lps_from_index)
@@ -98,6 +103,7 @@ def test_whole_numbers_of_any_type(dtype: str) -> None:
     assert [f.code for f in found.findings] == ["N-LBL-02"] * int(np.dtype(dtype).kind == "f")
 
 
+@pytest.mark.fault("V10")
 @pytest.mark.parametrize(
     ("value", "problem"),
     [
@@ -121,6 +127,7 @@ def test_an_image_is_no_label_map() -> None:
         read_label_map(nrrd_bytes(LabelVolume(values, KNEE.lps_from_index)), "labels.nrrd")
 
 
+@pytest.mark.fault("V01")
 @pytest.mark.parametrize("writer", ["nifti1 gz", "nifti1", "nrrd lps", "nrrd raw", "mha", "mha raw"])
 def test_truncated_anywhere(writer: str, tmp_path: Path) -> None:
     name, write = WRITERS[writer]
@@ -130,6 +137,7 @@ def test_truncated_anywhere(writer: str, tmp_path: Path) -> None:
             read_label_map(data[: min(len(data) * part // 16, len(data) - 1)], name)
 
 
+@pytest.mark.fault("V01")
 @pytest.mark.parametrize("writer", ["nifti1 gz", "nifti1", "nrrd lps", "nrrd raw", "mha", "mha raw"])
 def test_trailing_bytes(writer: str, tmp_path: Path) -> None:
     name, write = WRITERS[writer]
@@ -137,6 +145,7 @@ def test_trailing_bytes(writer: str, tmp_path: Path) -> None:
         read_label_map(write(KNEE, tmp_path) + b"rest", name)
 
 
+@pytest.mark.fault("V01")
 @pytest.mark.parametrize("writer", ["nifti1 gz", "nrrd lps", "mha"])
 def test_flipped_bits_in_compressed_voxels(writer: str, tmp_path: Path) -> None:
     """Each is refused, or (a flag of the gzip header) harmless: never another volume."""
@@ -154,12 +163,14 @@ def test_flipped_bits_in_compressed_voxels(writer: str, tmp_path: Path) -> None:
     assert refusals > 0.9 * len(range(begin + 10, len(data), 7))
 
 
+@pytest.mark.fault("V21")
 @pytest.mark.parametrize("name", ["labels.nhdr", "labels.mhd", "labels.hdr", "labels.img", "labels.png", "labels"])
 def test_other_kinds_of_files(name: str) -> None:
     with refused("E-IO-12", "labels"):
         read_label_map(nrrd_bytes(KNEE), name)
 
 
+@pytest.mark.fault("V21")
 @pytest.mark.parametrize(
     "line", [b"data file: /etc/passwd", b"datafile: x.raw", b"byte skip: -1", b"line skip: 2", b"encoding: hex"]
 )
@@ -169,12 +180,14 @@ def test_nrrd_that_points_elsewhere(line: bytes) -> None:
         read_label_map(data.replace(b"dimension: 3\n", b"dimension: 3\n" + line + b"\n"), "labels.nrrd")
 
 
+@pytest.mark.fault("V21")
 def test_mha_that_points_elsewhere(tmp_path: Path) -> None:
     data = itk_bytes(KNEE, tmp_path, "x.mha").replace(b"= LOCAL", b"= /etc/passwd")
     with refused("E-IO-12", "in another file"):
         read_label_map(data, "labels.mha")
 
 
+@pytest.mark.fault("V08")
 @pytest.mark.parametrize(
     ("old", "new", "code", "problem"),
     [
@@ -201,6 +214,7 @@ def test_nrrd_headers_that_lie(old: bytes, new: bytes, code: str, problem: str) 
         read_label_map(data.replace(old, new), "labels.nrrd")
 
 
+@pytest.mark.fault("V08")
 @pytest.mark.parametrize(
     ("old", "new", "code", "problem"),
     [
@@ -222,6 +236,7 @@ def test_mha_headers_that_lie(old: bytes, new: bytes, code: str, problem: str, t
         read_label_map(data.replace(old, new), "labels.mha")
 
 
+@pytest.mark.fault("V08")
 @pytest.mark.parametrize(
     ("fields", "code", "problem"),
     [
@@ -256,6 +271,7 @@ def test_nifti_headers_that_lie(fields: dict[str, object], code: str, problem: s
             read_label_map(data, name)
 
 
+@pytest.mark.fault("V03", "V04")
 @pytest.mark.parametrize("forms", [(1, 0), (0, 1), (4, 2)])
 def test_nifti_with_one_form_or_both(forms: tuple[int, int]) -> None:
     image = nifti_image(KNEE)
@@ -274,6 +290,7 @@ def test_nifti_with_extensions_before_its_voxels(kind: type) -> None:
     assert_same(read_label_map(gzip.compress(data), "labels.nii.gz"), KNEE)
 
 
+@pytest.mark.fault("V09")
 def test_nifti_with_a_fourth_axis_of_one_and_no_unit() -> None:
     raw = with_header(nifti_bytes(KNEE, compressed=False), dim=(4, 26, 22, 24, 1, 1, 1, 1), xyzt_units=0)
     found = read_label_map(raw, "labels.nii")
@@ -281,6 +298,7 @@ def test_nifti_with_a_fourth_axis_of_one_and_no_unit() -> None:
     assert [finding.code for finding in found.findings] == ["N-GEO-02"]
 
 
+@pytest.mark.fault("V05")
 @pytest.mark.parametrize("shear", [1e-6, 5e-5, 2e-4, 1e-2, 0.3])
 def test_sheared_axes(shear: float) -> None:
     matrix = oblique_matrix()
@@ -293,6 +311,7 @@ def test_sheared_axes(shear: float) -> None:
             read_label_map(data, "labels.nrrd")
 
 
+@pytest.mark.fault("V07")
 @pytest.mark.parametrize(
     ("factor", "code", "problem"),
     [
@@ -314,6 +333,7 @@ def test_a_volume_smaller_than_any_joint() -> None:
         read_label_map(nrrd_bytes(small), "labels.nrrd")
 
 
+@pytest.mark.fault("V23")
 @pytest.mark.parametrize("layers", [1, 2])
 def test_layers_of_seg_nrrd(layers: int) -> None:
     values = np.stack([np.asarray(KNEE.values)] * layers)
@@ -329,6 +349,7 @@ def test_layers_of_seg_nrrd(layers: int) -> None:
             read_label_map(data, "labels.seg.nrrd")
 
 
+@pytest.mark.fault("V23")
 def test_segments_are_named() -> None:
     data = nrrd_bytes(KNEE, segment_keys({"Femur": 5, "Femoral cartilage": 1}))
     assert read_label_map(data, "labels.seg.nrrd").segments == {"Femur": 5, "Femoral cartilage": 1}
@@ -346,6 +367,7 @@ def test_segments_without_a_name_or_value_of_their_own(old: str, new: str) -> No
         read_label_map(data.replace(old.encode(), replacement.encode()), "labels.seg.nrrd")
 
 
+@pytest.mark.fault("V22")
 def test_limits_are_checked_before_anything_is_allocated() -> None:
     with refused("E-IO-14", "at most"):
         check_layout(Layout((100_000, 100_000, 100), np.dtype("u1")), "x")
@@ -353,6 +375,7 @@ def test_limits_are_checked_before_anything_is_allocated() -> None:
         check_layout(Layout((1000, 1000, 600), np.dtype("f8")), "x")
 
 
+@pytest.mark.fault("V22")
 def test_a_gzip_bomb_is_not_inflated() -> None:
     small = with_header(nifti_bytes(KNEE, compressed=False))
     bomb = gzip.compress(small + bytes(50_000_000))
