@@ -95,6 +95,19 @@ def label_presets() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in LABELS_FOLDER.glob("*.yaml")))
 
 
+def label_preset(name: str) -> dict[str, object]:
+    """Structures with their label values, as a label scheme that comes with the program lists them.
+
+    Raises
+    ------
+    ValueError
+        When there is none of that name; the message says what may have been meant.
+    """
+    if name not in label_presets():
+        raise ValueError(f"the label scheme {name!r} is not known{did_you_mean(name, label_presets())}")
+    return parse_yaml((LABELS_FOLDER / f"{name}.yaml").read_bytes())
+
+
 def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
     names = [name for name, _ in pairs]
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -187,11 +200,11 @@ def _labels(value: object, file: str) -> dict[str, int] | None:
 
 
 def _preset(name: str, file: str) -> dict[str, object]:
-    if name not in label_presets():
-        problem = f"{file}: the label scheme {name!r} is not known{did_you_mean(name, label_presets())}."
+    try:
+        return label_preset(name)
+    except ValueError as error:
         action = f"Use one of {listed(label_presets())}, or list each structure with its label value."
-        raise CaseRejected("E-CASE-05", problem, action)
-    return parse_yaml((LABELS_FOLDER / f"{name}.yaml").read_bytes())
+        raise CaseRejected("E-CASE-05", f"{file}: {error}.", action) from error
 
 
 def _mapping(value: object, file: str, key: str) -> dict[str, object] | None:

@@ -67,11 +67,13 @@ def load_settings(
     ConfigError
         A protocol or an override is wrong.
     CaseRejected
-        The case's own declaration is wrong.
+        The case's own declaration is wrong, or sets what only the site may set (E-CASE-07).
     """
     layers = settings_layers(case_folder, protocol, overrides)
     for layer in layers:
         _refuse_unknown_sections(layer, flow)
+        if layer.fault == "case":
+            _refuse_site_settings(layer, flow)
     merged: dict[str, object] = {}
     for layer in layers:
         merged = merge(merged, layer.values)
@@ -214,6 +216,28 @@ def _refuse_unknown_sections(layer: Layer, flow: Sequence[Stage]) -> None:
         if not isinstance(values, dict):
             problem = f"{layer.name}: {section} is {shown(values)}; expected settings of the stage {section}."
             raise _fault(layer, "value", problem, "Write each setting as name: value, indented below the stage.")
+
+
+def _refuse_site_settings(layer: Layer, flow: Sequence[Stage]) -> None:
+    """Whoever hands in a case must not decide what the site's computer runs: fields marked ``site_only``."""
+    for stage in flow:
+        for name in _site_settings(stage.Params, layer.values.get(stage.name)):
+            problem = f"{layer.name} sets {stage.name}.{name}, which only the site may set."
+            raise CaseRejected("E-CASE-07", problem, "Remove it there; who runs the program sets it in the protocol.")
+
+
+def _site_settings(model: type[BaseModel], values: object) -> Iterator[str]:
+    """Dotted names of the settings in nested values that are marked ``site_only``."""
+    if not isinstance(values, Mapping):
+        return
+    for name, described in model.model_fields.items():
+        if name not in values:
+            continue
+        extra, nested = described.json_schema_extra, described.annotation
+        if isinstance(extra, dict) and extra.get("site_only"):
+            yield name
+        elif isinstance(nested, type) and issubclass(nested, BaseModel):
+            yield from (f"{name}.{inner}" for inner in _site_settings(nested, values[name]))
 
 
 def _validated(stage: Stage, values: object, layers: Sequence[Layer]) -> StrictParams:

@@ -41,6 +41,8 @@ class CaseFacts:
         Structure name -> area of it that lies on the border of the volume (a shaft always does).
     landmarks : dict of str to Vector
         Landmarks that the user gave, LPS mm.
+    found_by : tuple of str
+        Programs of the site that found the bones in the CT, with their versions; empty where this program did.
     """
 
     case_id: str
@@ -54,6 +56,7 @@ class CaseFacts:
     shape: tuple[int, int, int]
     clipped_mm2: dict[str, float]
     landmarks: dict[str, Vector]
+    found_by: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

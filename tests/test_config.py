@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,12 +10,14 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import Field
 
 from pipeline import case_declaration, config
 from pipeline.config import joints, load_settings, merge, protocols
 from pipeline.engine.stage import StrictParams
 from pipeline.errors import CaseRejected, ConfigError
 from pipeline.flow import FLOW
+from pipeline.label_scheme import without_side
 from tests.toy_flow import TOY_FLOW, IntakeParams, QaParams, write_toy_configs
 
 JOINTS, PROTOCOLS, PRESETS = joints(), protocols(), case_declaration.label_presets()
@@ -256,12 +259,93 @@ def test_given_frames_of_a_case_replace_those_of_its_joint(case: Path, monkeypat
 
 
 @pytest.mark.parametrize("labels", PRESETS)
-def test_every_label_scheme_names_what_a_knee_needs(case: Path, monkeypatch: pytest.MonkeyPatch, labels: str) -> None:
+def test_every_label_scheme_names_structures_of_a_knee(
+    case: Path, monkeypatch: pytest.MonkeyPatch, labels: str
+) -> None:
     monkeypatch.undo()
     (case / "case.yaml").write_text(f"side: left\nlabels: {labels}")
     facts = load_settings(FLOW, case, "clinical")["intake"].model_dump()
-    assert set(facts["required"]) <= set(facts["labels"])
-    assert set(facts["labels"]) <= {*facts["required"], *facts["optional"]}
+    named = {without_side(name)[0] for name in facts["labels"]}
+    assert named <= {*facts["required"], *facts["optional"]}
+    # one task of TotalSegmentator alone does not find the knee; both are for a command each
+    assert set(facts["required"]) <= named or labels.startswith("totalsegmentator_")
+
+
+SITE = {"command": ["segment", "{ct}", "{labels}"], "labels": {"femur": 1, "tibia": 2}}
+
+
+@pytest.mark.parametrize("value", [[SITE], [], None, "x"])
+def test_a_case_cannot_say_what_the_site_runs(case: Path, monkeypatch: pytest.MonkeyPatch, value: object) -> None:
+    monkeypatch.undo()
+    (case / "case.yaml").write_text(f"side: left\nsettings: {{segment: {json.dumps({'commands': value})}}}")
+    with pytest.raises(CaseRejected, match=r"E-CASE-07 case.yaml sets segment.commands, which only the site may set\."):
+        load_settings(FLOW, case, "clinical")
+    with pytest.raises(CaseRejected, match=r"E-CASE-07 "):  # nor when the site sets it too
+        load_settings(FLOW, case, "clinical", [f"segment.commands={json.dumps([SITE])}"])
+
+
+def test_the_site_says_what_it_runs(case: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    (case / "case.yaml").write_text("side: left\nsettings: {segment: {smoothing_mm: 0.5}}")
+    own = write_protocol(case.parent, f"segment: {{command_limit_s: 60, commands: {json.dumps([SITE])}}}")
+    for found in (
+        load_settings(FLOW, case, own)["segment"].model_dump(mode="json"),
+        load_settings(FLOW, case, "clinical", [f"segment.commands={json.dumps([SITE])}"])["segment"].model_dump(),
+    ):
+        (command,) = found["commands"]
+        assert (list(command["command"]), command["labels"]) == (SITE["command"], SITE["labels"])
+        assert found["smoothing_mm"] == 0.5
+
+
+class Inner(StrictParams):
+    limit_s: float = Field(default=1.0, json_schema_extra={"site_only": True})
+
+
+class Outer(StrictParams):
+    inner: Inner = Inner()
+
+
+def test_the_mark_holds_inside_nested_settings_as_well(case: Path) -> None:
+    flow = (*TOY_FLOW, dataclasses.replace(TOY_FLOW[1], number=85, name="nested", Params=Outer))
+    (case / "case.yaml").write_text("settings: {nested: {inner: {limit_s: 2}}}")
+    with pytest.raises(CaseRejected, match=r"E-CASE-07 case.yaml sets nested.inner.limit_s, which only the site may"):
+        load_settings(flow, case, "clinical")
+    (case / "case.yaml").unlink()
+    found = load_settings(flow, case, "clinical", ["nested.inner.limit_s=2"])["nested"]
+    assert found == Outer(inner=Inner(limit_s=2.0))
+
+
+@pytest.mark.parametrize(
+    ("command", "problem"),
+    [
+        ({"command": ["s", "{ct}"]}, r"segment.commands.0: the command has no {labels}\."),
+        ({"command": ["s", "{labels}"]}, r"segment.commands.0: the command has no {ct}\."),
+        (
+            {"command": ["s", "{ct}", "{labels}", "{id}"]},
+            r"segment.commands.0: {id} stands for nothing; {ct}, {labels}",
+        ),
+        ({"command": ["{side}/s", "{ct}", "{labels}"]}, r"segment.commands.0: the program itself cannot depend on the"),
+        ({"command": "s {ct} {labels}"}, r"segment.commands.0.command is \"s {ct} {labels}\"; it must be a valid"),
+        ({"labels": "mskd"}, r"segment.commands.0.labels: the label scheme 'mskd' is not known \(did you mean 'mskt'"),
+        ({"labels": {"femur": 0}}, r"segment.commands.0.labels.femur is 0; it must be greater than or equal to 1"),
+        ({"labels": {}}, r"segment.commands.0.labels is \{\}; Dictionary should have at least 1 item"),
+        ({"version": "/opt/x"}, r"segment.commands.0.version is \"/opt/x\"; String should match"),
+        ({"shell": True}, r"segment.commands.0.shell is not a setting"),
+    ],
+)
+def test_wrong_commands(case: Path, monkeypatch: pytest.MonkeyPatch, command: dict[str, object], problem: str) -> None:
+    monkeypatch.undo()
+    (case / "case.yaml").write_text("side: left")
+    own = write_protocol(case.parent, json.dumps({"segment": {"commands": [SITE | command]}}))
+    with pytest.raises(ConfigError, match=f"E-CFG-0[12] protocol own: {problem}"):
+        load_settings(FLOW, case, own)
+
+
+def test_a_structure_has_one_command(case: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    twice = json.dumps([SITE, SITE | {"labels": {"femur_right": 3, "fibula": 4}}])
+    with pytest.raises(ConfigError, match=r"E-CFG-02 .*segment.commands: more than one command is to find: femur\."):
+        load_settings(FLOW, case, "clinical", [f"segment.commands={twice}"])
 
 
 def test_there_is_a_knee_and_the_two_protocols() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline import __version__
 from pipeline.engine.stage import Findings
-from pipeline.records import SurfaceOrigin, Verdict
+from pipeline.records import CaseFacts, SurfaceOrigin, Verdict
 from pipeline.report.evidence import CURVES, STATUS_WORDS, Evidence, cell, neutral_varus, plain, shown_flexions
 from pipeline.report.figure_frame import RESEARCH_USE
 from pipeline.report.figures import Drawn
@@ -82,7 +82,7 @@ def _context(page: Page) -> dict[str, Any]:
         "mesh_quality": evidence.mesh_quality,
         "verdict": page.verdict,
         "more_reasons": _count_of_reviews(page) - len(page.verdict.reasons),
-        "origins": [_origin_row(origin, evidence.facts.source) for origin in evidence.origins],
+        "origins": [_origin_row(origin, evidence.facts) for origin in evidence.origins],
         "made": [plain(o.structure) for o in evidence.origins if o.origin == "synthesised"],
         "figures": [_figure(item) for item in page.figures],
         "curves": CURVES,
@@ -96,9 +96,9 @@ def _count_of_reviews(page: Page) -> int:
     return len({finding.message for finding in every if finding.severity == "review"})
 
 
-def _origin_row(origin: SurfaceOrigin, source: str) -> tuple[str, str, str, str]:
-    found = source == "ct" and origin.origin == "labelled"
-    words = "found in the CT by the program" if found else ORIGIN_WORDS[origin.origin]
+def _origin_row(origin: SurfaceOrigin, facts: CaseFacts) -> tuple[str, str, str, str]:
+    found = facts.source == "ct" and origin.origin == "labelled"
+    words = f"found in the CT by {', '.join(facts.found_by) or 'the program'}" if found else ORIGIN_WORDS[origin.origin]
     return plain(origin.structure), BODY_WORDS[origin.body], words, origin.origin
 
 

@@ -1,6 +1,6 @@
 """Stage 10, intake: foreign files become one canonical label volume (or named meshes) in LPS, or are refused.
 
-The only stage that sees a foreign file.
+Foreign bytes are read in a sealed process; only what a site's own program leaves is read by the next stage.
 """
 
 from __future__ import annotations
@@ -8,38 +8,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Annotated
 
-import numpy as np
-from pydantic import Field, StringConstraints
+from pydantic import Field
 
 from pipeline.artifacts import CT, GIVEN_FACTS, GIVEN_LABELS, GIVEN_MESHES, LIGAMENTS
 from pipeline.engine.artifacts import SOURCE, SourceFolder
-from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage, StrictParams
+from pipeline.engine.stage import Finding, Findings, Inputs, Limits, Outputs, Severity, Stage, StrictParams
 from pipeline.errors import CaseRejected
 from pipeline.files.case_files import CT_FOLDER, CaseFiles, choose_files, read_file
+from pipeline.files.checksums import check_checksums
 from pipeline.files.ct_volumes import CtScan, read_ct_volume
 from pipeline.files.ligaments_file import read_ligaments
 from pipeline.files.markups import read_markups
 from pipeline.files.meshes import read_mesh
-from pipeline.files.volumes import LabelMap, read_label_map
-from pipeline.geometry.label_cleaning import LabelRepair, clean_label
+from pipeline.files.volumes import LabelMap, check_belongs, read_label_map
 from pipeline.geometry.mesh import TriangleMesh
-from pipeline.geometry.volume import LabelVolume, border_areas_mm2, box_of, cropped
-from pipeline.label_review import (
-    is_soft,
-    review_anisotropy,
-    review_clipping,
-    review_order,
-    review_pieces,
-    review_touching,
-    review_unused,
-)
-from pipeline.label_scheme import MARGIN_VOXELS, number_structures, renumbered, structure_values
+from pipeline.label_review import review_unused
+from pipeline.label_scheme import LabelValue, StructureName, number_structures, renumbered, structure_values
+from pipeline.label_taking import take_labels
 from pipeline.records import CaseFacts, LigamentFibre, Side
-
-StructureName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
-LabelValue = Annotated[int, Field(ge=1, le=65_535)]
 
 
 class Params(StrictParams):
@@ -69,18 +56,20 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     Raises
     ------
     CaseRejected
-        E-SIDE-01, E-IO-*, E-GEO-*, E-LBL-*, E-LMK-*, E-LIG-*; see ``docs/messages.md``.
+        E-SIDE-*, E-IO-*, E-GEO-*, E-LBL-*, E-LMK-*, E-LIG-*; see ``docs/messages.md``.
     """
     source = reads[SOURCE]
     side = _declared_side(params)
     files = choose_files(source.files)
+    seen = check_checksums(source.files, {name: read_file(source, name) for name in files.checksums})
     facts = _common_facts(source, files, params, side)
     out[LIGAMENTS] = _ligaments(source, files.ligaments)
     scan = _ct(source, files.ct, side)
     out[CT] = None if scan is None else scan.volume
-    seen = () if scan is None else scan.findings
+    seen += () if scan is None else scan.findings
     if files.label_map is not None:
         label_map = read_label_map(read_file(source, files.label_map), files.label_map)
+        check_belongs(label_map, files.label_map, side, "" if scan is None else scan.frame_of_reference)
         return seen + _take_labels(label_map, files.label_map, params, facts, out)
     out[GIVEN_LABELS] = None
     if files.meshes:
@@ -91,7 +80,8 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     return seen
 
 
-STAGE = Stage(10, "intake", (SOURCE,), (GIVEN_FACTS, GIVEN_LABELS, CT, GIVEN_MESHES, LIGAMENTS), Params, run)
+_LEAVES = (GIVEN_FACTS, GIVEN_LABELS, CT, GIVEN_MESHES, LIGAMENTS)
+STAGE = Stage(10, "intake", (SOURCE,), _LEAVES, Params, run, limits=Limits())
 
 
 def _declared_side(params: Params) -> Side:
@@ -182,57 +172,10 @@ def _facts_of_meshes(facts: CaseFacts, meshes: Mapping[str, TriangleMesh]) -> Ca
 
 def _take_labels(label_map: LabelMap, file: str, params: Params, facts: CaseFacts, out: Outputs) -> Findings:
     """Map, clean and judge the labels; leave the three artifacts."""
-    values, notes = structure_values(label_map.segments, params.labels, params.wanted, file)
+    values, notes = structure_values(label_map.segments, params.labels, params.wanted, file, facts.side)
     structures = number_structures(values, label_map.counts, params.required, file)
-    volume, repairs = _cleaned(renumbered(label_map.volume, values, structures), structures, out)
-    out[GIVEN_FACTS] = _facts_of_labels(facts, volume, structures, repairs)
-    out[GIVEN_LABELS] = volume
-    out[GIVEN_MESHES] = {}
+    volume = renumbered(label_map.volume, values, structures)
+    taken = take_labels(volume, replace(facts, structures=structures), params.required, file, out.progress)
+    out[GIVEN_FACTS], out[GIVEN_LABELS], out[GIVEN_MESHES] = taken.facts, taken.volume, {}
     used = [values[name] for name in structures]
-    return (
-        *label_map.findings,
-        *notes,
-        *review_unused(label_map.counts, used, file),
-        *review_pieces(repairs, params.required, file),
-        *review_order(volume, structures, file),
-        *review_touching(volume, structures),
-        *review_anisotropy(volume.spacing_mm),
-        *(finding for name in structures for finding in review_clipping(name, _on_border(volume, structures[name]))),
-    )
-
-
-def _cleaned(
-    volume: LabelVolume, structures: Mapping[str, int], out: Outputs
-) -> tuple[LabelVolume, dict[str, LabelRepair]]:
-    """Islands taken away and cavities filled, structure by structure."""
-    values = np.array(volume.values)
-    repairs: dict[str, LabelRepair] = {}
-    for done, (name, number) in enumerate(structures.items()):
-        out.progress(done, len(structures))
-        box = box_of(values == number)
-        part = values[box]
-        mask, repairs[name] = clean_label(part == number, part == 0, one_piece=not is_soft(name))
-        part[(part == number) & ~mask] = 0
-        part[mask] = number
-    # again, because an island may have held the volume open
-    return cropped(LabelVolume(values, volume.lps_from_index), MARGIN_VOXELS), repairs
-
-
-def _facts_of_labels(
-    facts: CaseFacts, volume: LabelVolume, structures: Mapping[str, int], repairs: Mapping[str, LabelRepair]
-) -> CaseFacts:
-    i, j, k = volume.values.shape
-    x, y, z = map(float, volume.spacing_mm)
-    return replace(
-        facts,
-        structures=dict(structures),
-        voxels={name: repair.voxels for name, repair in repairs.items()},
-        spacing_mm=(x, y, z),
-        shape=(i, j, k),
-        clipped_mm2={name: float(_on_border(volume, number).sum()) for name, number in structures.items()},
-    )
-
-
-def _on_border(volume: LabelVolume, number: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """(6,) area of one structure on each face of the volume; cropping kept the faces that labels touch."""
-    return border_areas_mm2(np.asarray(volume.values) == number, volume.spacing_mm)
+    return (*label_map.findings, *notes, *review_unused(label_map.counts, used, file), *taken.findings)

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from pipeline.artifacts import CASE_FACTS, CT, GIVEN_FACTS, GIVEN_LABELS, LABELS
 from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage, StrictParams
 from pipeline.errors import CaseRejected
-from pipeline.geometry.label_fit import BoneFit, bone_fit
-from pipeline.geometry.volume import CtVolume, LabelVolume
+from pipeline.geometry.volume import CtVolume
+from pipeline.label_fitting import FitLimits, hold_against_ct
 from pipeline.records import CaseFacts
+from pipeline.site_labels import SiteCommand, labels_of_commands, named_twice
 
 if TYPE_CHECKING:
     from pipeline.adapters.bone_segmentation import BoneSegmentation
@@ -31,6 +31,30 @@ class Params(StrictParams):
     least_contrast_hu: float = Field(
         100.0, ge=0, le=2000, description="given labels of bone are this much denser than what lies around them"
     )
+    offset_review_mm: float = Field(
+        0.75, ge=0, le=50, description="given labels that lie farther off the bone in the CT need review"
+    )
+    most_offset_mm: float = Field(2.0, ge=0, le=50, description="given labels that lie farther off are refused")
+    commands: tuple[SiteCommand, ...] = Field(
+        default=(),
+        max_length=8,
+        description="segmentation programs of the site, used in place of this program's own; never set by a case",
+        json_schema_extra={"site_only": True},
+    )
+    command_limit_s: float = Field(
+        3600.0,
+        gt=0,
+        le=86_400,
+        description="each of those programs is ended after so many seconds; never set by a case",
+        json_schema_extra={"site_only": True},
+    )
+
+    @field_validator("commands")
+    @classmethod
+    def _each_structure_has_one_command(cls, commands: tuple[SiteCommand, ...]) -> tuple[SiteCommand, ...]:
+        if twice := named_twice(commands):
+            raise ValueError(f"more than one command is to find: {', '.join(twice)}")
+        return commands
 
 
 def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
@@ -39,14 +63,20 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     Raises
     ------
     CaseRejected
-        E-SEG-01 when there is no such knee in the CT, E-LBL-06 when labels do not belong to it.
+        E-SEG-01 when there is no such knee in the CT, E-LBL-08 and E-LBL-09 when labels do not belong to it, E-SEG-08
+        when those of the site's programs do not lie on bone; what
+        :func:`pipeline.site_labels.labels_of_commands` raises.
     """
     facts, labels, ct = reads[GIVEN_FACTS], reads[GIVEN_LABELS], reads[CT]
     if facts.source != "ct":
         out[CASE_FACTS], out[LABELS] = facts, labels
-        return () if ct is None or labels is None else _fitting(ct, labels, facts, params)
+        return () if ct is None or labels is None else hold_against_ct(ct, labels, facts, _fit_limits(params))
     if ct is None:
         raise ValueError("a case of a CT has no CT")
+    if params.commands:
+        taken = labels_of_commands(ct, facts, params.commands, params.command_limit_s, out.progress)
+        out[CASE_FACTS], out[LABELS] = taken.facts, taken.volume
+        return (*taken.findings, *hold_against_ct(ct, taken.volume, taken.facts, _fit_limits(params)))
     found = _found(ct, facts, params)
     out[CASE_FACTS], out[LABELS] = _facts_of(facts, found), found.labels
     return _findings(found, params)
@@ -98,31 +128,8 @@ def _findings(found: BoneSegmentation, params: Params) -> Findings:
     return tuple(out)
 
 
-def _fitting(ct: CtVolume, labels: LabelVolume, facts: CaseFacts, params: Params) -> Findings:
-    """Whether labels of bone lie on bone."""
-    fits: dict[str, BoneFit] = {
-        name: bone_fit(ct, labels, facts.structures[name]) for name in ("femur", "tibia") if name in facts.structures
-    }
-    if bad := {name: fit for name, fit in fits.items() if not _fits(fit, params)}:
-        raise CaseRejected(
-            "E-LBL-06",
-            f"The label map does not belong to this CT: {_words(bad)}.",
-            "Check that labels and CT are of the same patient, study and series.",
-        )
-    message = f"The labels lie on bone in the CT: {_words(fits)}."
-    return (Finding("N-LBL-06", Severity.NOTE, message),)
-
-
-def _fits(fit: BoneFit, params: Params) -> bool:
-    return fit.covered > 0.99 and fit.inside_hu - fit.outside_hu >= params.least_contrast_hu
-
-
-def _words(fits: Mapping[str, BoneFit]) -> str:
-    return "; ".join(
-        f"{name} at its edge {fit.inside_hu:.0f} HU, around it {fit.outside_hu:.0f} HU"
-        + (f", {100 * (1 - fit.covered):.0f} % of it outside the CT" if fit.covered < 0.995 else "")
-        for name, fit in fits.items()
-    )
+def _fit_limits(params: Params) -> FitLimits:
+    return FitLimits(params.least_contrast_hu, params.offset_review_mm, params.most_offset_mm)
 
 
 STAGE = Stage(20, "segment", (GIVEN_FACTS, GIVEN_LABELS, CT), (CASE_FACTS, LABELS), Params, run)

@@ -96,6 +96,7 @@ def test_cut_shafts_stay_cut_and_full() -> None:
     assert found.bones["patella"].cut_mm2 == 0.0
 
 
+@pytest.mark.fault("V19", "V20")
 def test_the_declared_leg_of_two_on_a_table_with_metal_noted() -> None:
     x, y, z = (float(number) for number in _middle(knee(), "femur"))
     spec = replace(COARSE, other_leg="left", table_mm=10.0, metal_mm=(x, y, z))
@@ -124,6 +125,7 @@ def test_the_order_of_the_axes_does_not_matter() -> None:
     np.testing.assert_allclose(first.labels.lps_from_index, second.labels.lps_from_index, atol=1e-9)
 
 
+@pytest.mark.fault("V18")
 def test_a_leg_of_the_other_side_is_refused() -> None:
     with pytest.raises(ValueError, match="declared as the left one, but its fibula lies"):
         segment_bones(synthetic_ct(knee(), BONES, COARSE), "left")

@@ -132,6 +132,7 @@ def test_a_moved_header_gives_the_same_table(done: Done, tmp_path: Path) -> None
         assert deg < 0.02
 
 
+@pytest.mark.fault("V18")
 def test_a_wrong_side_is_refused_and_the_good_result_stays(done: Done, tmp_path: Path) -> None:
     case, results = tmp_path / "cases" / "right", tmp_path / "results" / "right"
     shutil.copytree(done.case, case)

@@ -9,7 +9,6 @@ from scipy import ndimage
 
 from pipeline.geometry.bone_parts import (
     Piece,
-    averaged,
     boundary_hu,
     chosen_knee,
     contested,
@@ -67,16 +66,6 @@ def test_metal_does_not_raise_the_boundary() -> None:
     values = np.full((20, 20, 20), 300, np.float32)
     values[10, 10, 10] = 3071
     assert boundary_hu(values, ONE).max() == pytest.approx(50 + 0.6 * 250)
-
-
-def test_averages_keep_the_mean_and_the_place() -> None:
-    ramp = np.arange(40, dtype=np.int16)[:, None, None] * np.ones((40, 20, 12), np.int16)
-    matrix = np.diag([0.6, 0.7, 1.5, 1.0])
-    values, coarse, factors = averaged(CtVolume(ramp, matrix), 1.5)
-    assert factors == (2, 2, 1)
-    assert values.mean() == pytest.approx(ramp.mean())
-    # the ramp is linear in space: the average at the new centre is the ramp there
-    np.testing.assert_allclose(values[:, 0, 0], (coarse[0, 0] * np.arange(20) + coarse[0, 3]) / 0.6, rtol=1e-6)
 
 
 def test_refined_undoes_averaging_of_whole_blocks() -> None:

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pipeline.geometry.volume import (
+    CtVolume,
     LabelVolume,
+    averaged,
     axis_codes,
     border_areas_mm2,
     box_of,
@@ -178,3 +180,23 @@ def test_areas_of_a_box() -> None:
     assert shared_area_mm2(values, (1, 2), spacing) == 3 * 2 * 2.0
     assert shared_area_mm2(values, (2, 1), spacing) == 3 * 2 * 2.0
     assert shared_area_mm2(values, (1, 3), spacing) == 0.0
+
+
+def test_averages_keep_the_mean_and_the_place() -> None:
+    ramp = np.arange(40, dtype=np.int16)[:, None, None] * np.ones((40, 20, 12), np.int16)
+    matrix = np.diag([0.6, 0.7, 1.5, 1.0])
+    values, coarse, factors = averaged(CtVolume(ramp, matrix), 1.5)
+    assert factors == (2, 2, 1)
+    assert values.mean() == pytest.approx(ramp.mean())
+    # the ramp is linear in space: the average at the new centre is the ramp there
+    np.testing.assert_allclose(values[:, 0, 0], (coarse[0, 0] * np.arange(20) + coarse[0, 3]) / 0.6, rtol=1e-6)
+
+
+def test_the_last_blocks_are_the_means_of_what_is_left() -> None:
+    values = np.random.default_rng(3).integers(-1000, 3000, (7, 5, 9)).astype(np.int16)
+    found, _, (i, j, k) = averaged(CtVolume(values, np.diag([0.6, 0.9, 0.5, 1.0])), 2.0)
+    assert (i, j, k) == (3, 2, 4)
+    assert found.shape == (3, 3, 3)
+    for at in np.ndindex(3, 3, 3):
+        block = values[tuple(slice(n * size, (n + 1) * size) for n, size in zip(at, (i, j, k), strict=True))]
+        assert found[at] == pytest.approx(block.mean(), rel=1e-6)

@@ -168,3 +168,5 @@ def test_a_series_of_files_is_one_row_of_the_inputs() -> None:
     assert "b" * 64 in page
     assert "from a CT</h1>" in page
     assert "found in the CT by the program" in page
+    by_site = replace(evidence.facts, source="ct", found_by=("TotalSegmentator 2.4.0",))
+    assert "found in the CT by TotalSegmentator 2.4.0" in html(replace(evidence, facts=by_site))

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from pydicom import dcmread
 
 from pipeline.artifacts import CT, GIVEN_FACTS, GIVEN_LABELS, GIVEN_MESHES, LIGAMENTS
 from pipeline.engine.artifacts import SOURCE, Artifact, SourceFolder
@@ -21,10 +24,14 @@ from pipeline.files.meshes import encode_ply, encode_stl
 from pipeline.files.nrrd_format import encode_nrrd
 from pipeline.files.strict_yaml import parse_yaml
 from pipeline.geometry.mesh import TriangleMesh
+from pipeline.geometry.phantom import PHANTOM_LABELS
 from pipeline.geometry.volume import CtVolume, LabelVolume
-from pipeline.records import CaseFacts, LigamentFibre
+from pipeline.records import CaseFacts, LigamentFibre, Side
 from pipeline.stages.intake import STAGE, Params
 from tests.files.label_samples import knee_like, nifti_bytes, nrrd_bytes, restored, segment_keys
+from tests.files.seg_samples import KNEE as SEG_KNEE
+from tests.files.seg_samples import LEFT, SEGMENTS, SegSpec, seg_dataset
+from tests.two_legs import leg, side_by_side, two_legs
 
 T = TypeVar("T")
 
@@ -161,6 +168,7 @@ def test_the_side_is_never_guessed(tmp_path: Path) -> None:
         run_on(tmp_path, knee_like(), with_params(side=None))
 
 
+@pytest.mark.fault("V13")
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
@@ -177,6 +185,7 @@ def test_missing_structures(changes: dict[str, Any], problem: str, tmp_path: Pat
         run_on(tmp_path, knee_like(), with_params(**changes))
 
 
+@pytest.mark.fault("V13")
 def test_two_structures_with_one_value(tmp_path: Path) -> None:
     with refused("E-LBL-03", r"Label 5 is given to more than one structure of labels\.nrrd: femur, tibia"):
         run_on(tmp_path, knee_like(), with_params(labels={"femur": 5, "tibia": 5}))
@@ -203,11 +212,13 @@ def test_two_segments_of_one_name(tmp_path: Path) -> None:
         Result(tmp_path, PARAMS)
 
 
+@pytest.mark.fault("V14")
 def test_femur_below_tibia(tmp_path: Path) -> None:
     with refused("E-LBL-06", "The femur lies 28 mm below the tibia"):
         run_on(tmp_path, knee_like(), with_params(labels={"femur": 6, "tibia": 5}))
 
 
+@pytest.mark.fault("V14")
 def test_femur_beside_tibia(tmp_path: Path) -> None:
     knee = knee_like()
     lying = np.array([[0, 0, 1.0, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]) @ knee.lps_from_index
@@ -215,11 +226,48 @@ def test_femur_beside_tibia(tmp_path: Path) -> None:
     assert "W-GEO-02" in result.codes(Severity.REVIEW)
 
 
+@pytest.mark.fault("V14")
 def test_two_femora(tmp_path: Path) -> None:
     with refused("E-LBL-07", "femur consists of 2 separate pieces"):
         run_on(tmp_path, edited(other=((slice(22, 26), slice(12, 20), slice(14, 24)), 5)))
 
 
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_two_legs_in_one_label_map(tmp_path: Path, side: Side) -> None:
+    every = dict(PHANTOM_LABELS)
+    params = Params(side=side, labels=every, required=["femur", "tibia"], optional=sorted(every))
+    two, one = run_on(tmp_path, two_legs(), params), run_on(tmp_path, leg(side), params)
+    np.testing.assert_array_equal(two.volume.values, one.volume.values)
+    assert two.facts.voxels == one.facts.voxels
+    assert [code for code in two.codes(Severity.NOTE) if code not in one.codes(Severity.NOTE)] == ["N-LEG-01"]
+    assert two.codes(Severity.REVIEW) == one.codes(Severity.REVIEW)
+
+
+def test_two_legs_that_cannot_be_told_apart(tmp_path: Path) -> None:
+    every = dict(PHANTOM_LABELS)
+    params = Params(side="right", labels=every, required=["femur", "tibia"], optional=sorted(every))
+    with refused("E-LEG-01", r"There seems to be more than one leg in labels\.nrrd, .*the fibula of the right leg"):
+        run_on(tmp_path, side_by_side(leg("left"), leg("right")), params)
+
+
+def test_a_declared_leg_without_a_required_structure(tmp_path: Path) -> None:
+    params = Params(side="right", labels=dict(PHANTOM_LABELS), required=["femur", "tibia", "patella"], optional=[])
+    values = np.array(leg("right").values)
+    values[values == PHANTOM_LABELS["patella"]] = 0
+    with refused("E-LBL-01", r"The right leg in labels\.nrrd has no patella\."):
+        run_on(tmp_path, side_by_side(LabelVolume(values, leg("right").lps_from_index), leg("left")), params)
+
+
+def test_values_that_are_named_for_a_side(tmp_path: Path) -> None:
+    params = with_params(labels={"femur_right": 5, "femur_left": 9, "tibia": 6}, optional=[])
+    result = run_on(tmp_path, knee_like(), params)
+    assert result.facts.structures == {"femur": 1, "tibia": 2}
+    assert "N-LEG-02" in result.codes(Severity.NOTE)
+    with refused("E-LBL-01", r"Label 9 \(femur\) is empty in labels\.nrrd"):
+        run_on(tmp_path, knee_like(), params.model_copy(update={"side": "left"}))
+
+
+@pytest.mark.fault("V15")
 def test_an_island_is_removed_and_named(tmp_path: Path) -> None:
     result = run_on(tmp_path, edited(island=((24, 20, slice(10, 13)), 5)))
     assert result.facts.voxels["femur"] == 16 * 12 * 10
@@ -227,6 +275,7 @@ def test_an_island_is_removed_and_named(tmp_path: Path) -> None:
     assert result.volume.values.shape == run_on(tmp_path, knee_like()).volume.values.shape
 
 
+@pytest.mark.fault("V15")
 def test_a_larger_island_is_looked_at(tmp_path: Path) -> None:
     result = run_on(tmp_path, edited(island=((slice(22, 25), slice(18, 20), slice(10, 18)), 5)))
     assert result.codes(Severity.REVIEW) == ["W-LBL-01"]
@@ -239,6 +288,7 @@ def test_cartilage_may_be_in_pieces(tmp_path: Path) -> None:
     assert result.codes(Severity.REVIEW) == ["W-LBL-01"]
 
 
+@pytest.mark.fault("V15")
 def test_cavities_are_filled(tmp_path: Path) -> None:
     result = run_on(tmp_path, edited(cavity=((10, 10, 18), 0)))
     assert result.facts.voxels["femur"] == 16 * 12 * 10
@@ -247,17 +297,20 @@ def test_cavities_are_filled(tmp_path: Path) -> None:
     assert large.codes(Severity.REVIEW) == ["W-LBL-02"]
 
 
+@pytest.mark.fault("V14")
 def test_bones_that_touch(tmp_path: Path) -> None:
     result = run_on(tmp_path, edited(bridge=((slice(5, 12), slice(6, 12), slice(10, 14)), 6)))
     assert "W-LBL-03" in result.codes(Severity.REVIEW)
 
 
+@pytest.mark.fault("V16")
 def test_a_structure_cut_by_the_field_of_view(tmp_path: Path) -> None:
     result = run_on(tmp_path, edited(plate=((slice(0, 4), slice(5, 17), slice(12, 14)), 1)))
     clipped = [finding.message for finding in result.findings if finding.code == "W-FOV-01"]
     assert clipped == ["The field of view cuts femoral_cartilage over 72 mm2."]
 
 
+@pytest.mark.fault("V16")
 def test_a_bone_cut_on_a_second_side(tmp_path: Path) -> None:
     result = run_on(tmp_path, edited(spur=((slice(0, 4), slice(5, 17), slice(16, 18)), 5)))
     assert [f.message for f in result.findings if f.code == "W-FOV-01"] == [
@@ -265,6 +318,7 @@ def test_a_bone_cut_on_a_second_side(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.fault("V17")
 def test_thick_slices(tmp_path: Path) -> None:
     knee = knee_like()
     thick = LabelVolume(knee.values, knee.lps_from_index @ np.diag([1.0, 1.0, 2.4, 1.0]))
@@ -417,4 +471,52 @@ def test_two_cts_are_too_many(tmp_path: Path) -> None:
     (tmp_path / "ct" / "1.dcm").write_bytes(b"x")
     (tmp_path / "ct.nrrd").write_bytes(encode_nrrd(small_ct()))
     with pytest.raises(CaseRejected, match="E-IO-16 The case folder holds more than one CT"):
+        Result(tmp_path, PARAMS)
+
+
+def with_series(folder: Path) -> str:
+    """A CT series in the case; its frame of reference."""
+    (folder / "ct").mkdir()
+    files = encode_series(small_ct())
+    for name, data in files.items():
+        (folder / "ct" / name).write_bytes(data)
+    return str(dcmread(io.BytesIO(next(iter(files.values())))).FrameOfReferenceUID)
+
+
+def with_segmentation(folder: Path, frame_uid: str, spec: SegSpec | None = None) -> None:
+    """A DICOM segmentation beside it, of some frame of reference."""
+    dataset = seg_dataset(SEG_KNEE, spec)
+    dataset.FrameOfReferenceUID = frame_uid
+    dataset.save_as(folder / "labels.dcm")
+
+
+@pytest.mark.fault("V11")
+def test_a_segmentation_of_another_frame_of_reference_is_refused(tmp_path: Path) -> None:
+    with_segmentation(tmp_path, with_series(tmp_path))
+    result = Result(tmp_path, PARAMS)
+    assert result.facts.source == "labels"
+    assert {"femur", "tibia", "femoral_cartilage"} <= result.facts.structures.keys()
+    with_segmentation(tmp_path, "1.2.3.4.99")
+    with refused("E-GEO-08", "labels.dcm does not belong to the CT of the case: it names another frame of reference"):
+        Result(tmp_path, PARAMS)
+
+
+@pytest.mark.fault("V18")
+def test_a_segmentation_coded_as_the_other_side_is_refused(tmp_path: Path) -> None:
+    left = SegSpec(segments=tuple(replace(one, modifiers=(LEFT,)) for one in SEGMENTS))
+    with_segmentation(tmp_path, "1.2.3.4.99", left)
+    with refused("E-SIDE-04", "The case is declared right, and the segments of labels.dcm are coded as left"):
+        Result(tmp_path, PARAMS)
+    assert Result(tmp_path, with_params(side="left")).facts.side == "left"
+
+
+def test_a_list_of_checksums_is_no_slice_and_is_held_against_the_files(tmp_path: Path) -> None:
+    with_series(tmp_path)
+    files = sorted((tmp_path / "ct").iterdir())
+    lines = [f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.name}\n" for file in files]
+    (tmp_path / "ct" / "SHA256SUMS").write_text("".join(lines))
+    (told,) = Result(tmp_path, PARAMS).findings
+    assert told.message == f"{len(files)} files are as listed in ct/SHA256SUMS."
+    files[-1].unlink()
+    with refused("E-IO-31", "of 30 files listed in ct/SHA256SUMS are missing"):
         Result(tmp_path, PARAMS)

@@ -115,7 +115,7 @@ def test_of_a_ct_the_report_keeps_the_planes_it_shows() -> None:
     assert len(cuts) == 4
     for cut in cuts:
         assert set(np.unique(cut)) <= {-1024, *(100 * np.unique(evidence.labels.values).astype(int) - 50)}
-        assert (cut > 0).any()
+        assert np.asarray(cut).max() > 0
 
 
 def test_settings_read_as_a_protocol_gives_them() -> None:
