@@ -34,7 +34,8 @@ LOOK = || [ $$? -eq 11 ]
 NEED_ID = if [ -z "$$ID" ]; then echo "Which case? Type: make $@ ID=P001" >&2; exit 20; fi
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo demo-real patient plan status report verify test lint format bench validate docs lock clean
+.PHONY: help setup setup-dev demo demo-real check patient plan status report verify test lint format faults fuzz bench \
+	validate docs lock clean
 
 help:  ## show this list
 	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | \
@@ -55,6 +56,9 @@ demo: setup  ## make a synthetic CT of a knee (DICOM, no labels), process it, sh
 demo-real: setup  ## the same with a real knee, segmented from MR (fetches 90 MB the first time)
 	@$(BIN)/python -P tools/fetch_real_knee.py build/demo-real/cases/knee
 	@$(BIN)/ct2lut run knee --cases build/demo-real/cases --results build/demo-real/results --protocol clinical $(LOOK)
+
+check: setup  ## look at a case before it is processed, in seconds: make check ID=P001
+	@$(NEED_ID); $(OPTIONS); $(BIN)/ct2lut check "$$@" -- "$$ID"
 
 patient: setup  ## process one case: make patient ID=P001
 	@$(NEED_ID); $(OPTIONS); $(BIN)/ct2lut run "$$@" --jobs "$$JOBS" -- "$$ID"
@@ -83,13 +87,19 @@ format: setup-dev  ## mend what `make lint` can mend by itself
 	@$(BIN)/ruff check --fix .
 	@$(BIN)/ruff format .
 
+faults: setup-dev  ## run the tests of what may be wrong with a case (docs/faults.md)
+	@$(BIN)/python -P -m pytest -m fault
+
+fuzz: setup-dev  ## mutate scanner files more than a hundred times as often as the tests do; nothing may break out
+	@HOSTILE_MUTATIONS=1000 $(BIN)/python -P -m pytest tests/end_to_end/test_hostile_files.py -k "flipped or spoilt"
+
 bench: setup-dev  ## measure speed
 	@$(BIN)/python -m tests.bench
 
 validate: setup-dev  ## compare with closed forms, the paper's test objects and published data
 	@$(BIN)/python -m tests.validate
 
-docs: setup-dev  ## write docs/commands.md, docs/settings.md and docs/messages.md from the code
+docs: setup-dev  ## write the reference pages in docs/ and the flow in pipeline/README.md from the code
 	@$(BIN)/python -m tools.reference docs
 
 lock: setup-dev  ## resolve the versions of every dependency again

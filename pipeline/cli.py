@@ -127,6 +127,30 @@ def plan(
 
 
 @app.command()
+def check(
+    case_id: CaseId,
+    cases: Cases = DEFAULT_CASES,
+    results: Results = DEFAULT_RESULTS,
+    protocol: Protocol = DEFAULT_PROTOCOL,
+    overrides: Overrides = None,
+) -> int:
+    """Look at a case before it is processed, in seconds.
+
+    One line for each check: OK, LOOK (before you use it) or STOP (a run would refuse it), and what to do next. Nothing
+    is written. It is a quick look: what is OK here may still need review after the run.
+
+    Example: ct2lut check P001
+    """
+    from pipeline.preflight import closing, exit_code, lines
+    from pipeline.quick_look import examine
+
+    request = _request(case_id, cases, results, protocol, overrides)
+    rows = examine(request, request.settings(_flow()))
+    _say(*(line for row in rows for line in lines(row)), *closing(case_id, rows))
+    return exit_code(rows)
+
+
+@app.command()
 def status(
     case_id: Annotated[str | None, typer.Argument(metavar="[ID]", help="One case; without it, all of them.")] = None,
     results: Results = DEFAULT_RESULTS,

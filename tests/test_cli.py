@@ -104,6 +104,7 @@ def test_a_missing_case_is_rejected(ct2lut: Run) -> None:
         (["run", "P001", "--protocol", "clinicl"], "E-CFG-03"),
         (["run", "../P001"], "E-ID-01"),
         (["plan", "../P001"], "E-ID-01"),
+        (["check", "../P001"], "E-ID-01"),
         (["report", "../P001"], "E-ID-01"),
         (["verify", "../P001"], "E-ID-01"),
         (["status", "../P001"], "E-ID-01"),
@@ -145,6 +146,59 @@ def test_plan_says_why_and_writes_nothing(ct2lut: Run) -> None:
     assert planned[0].split()[:2] == ["intake", "skip"]
     assert planned[1].split()[:2] == ["qa", "run"]
     assert "word" in planned[1]
+
+
+@pytest.fixture
+def knee(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs a command of the real flow in a folder with a coarse phantom, P001."""
+    monkeypatch.chdir(tmp_path)
+    cli.execute(["phantom", "cases", "--id", "P001", "--set", "spacing_mm=[2,2,2]"])
+    capsys.readouterr()
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        return cli.execute(arguments), *capsys.readouterr()
+
+    return run
+
+
+def test_a_check_that_finds_nothing(knee: Run) -> None:
+    before = listing(Path())
+    code, out, err = knee("check", "P001")
+    lines = out.splitlines()
+    assert (code, err) == (ExitCode.PASS, "")
+    assert lines[0].startswith("OK    scan range    ")
+    assert any(line.startswith("OK    joint space   ") for line in lines)
+    assert lines[-2] == "OK    P001: nothing speaks against processing it."
+    assert "quick look" in lines[-1]
+    assert listing(Path()) == before
+
+
+def test_a_check_with_something_to_look_at(knee: Run) -> None:
+    code, out, _ = knee("check", "P001", "--set", "anatomy.max_long_axis_uncertainty_deg=1.5")
+    lines = out.splitlines()
+    femur = next(index for index, line in enumerate(lines) if line.startswith("LOOK  femur"))
+    assert code == ExitCode.REVIEW
+    assert "its axis is sure only from 143 mm on" in lines[femur]
+    assert lines[femur + 1].strip().startswith("-> Scan or export more of the femur")
+    assert "LOOK  P001: 2 to look at." in lines
+
+
+def test_a_check_that_stops(knee: Run) -> None:
+    Path("cases/P001/case.yaml").write_text("joint: knee\n")
+    code, out, err = knee("check", "P001")
+    expected = [
+        "STOP  side          E-SIDE-01  The side of the body is not given with the case; it is never guessed.",
+        "                    -> Write 'side: right' or 'side: left' in case.yaml.",
+        "STOP  P001: a run would refuse this case.",
+    ]
+    assert (code, err) == (ExitCode.REJECTED, "")
+    assert out.splitlines() == expected
+
+
+def test_a_check_of_a_wrong_declaration_says_what_a_run_says(knee: Run) -> None:
+    Path("cases/P001/case.yaml").write_text("side: both\n")
+    assert knee("check", "P001") == knee("run", "P001")
+    assert knee("check", "P001")[0] == ExitCode.REJECTED
 
 
 def test_status_of_one_and_of_all(ct2lut: Run) -> None:
@@ -206,7 +260,9 @@ def test_version_and_help(ct2lut: Run) -> None:
     code, out, _ = ct2lut()
     assert code == 0
     assert "Research" in out
-    assert all(command in out for command in ("run", "plan", "status", "verify", "report", "lookup", "phantom"))
+    assert all(
+        command in out for command in ("run", "check", "plan", "status", "verify", "report", "lookup", "phantom")
+    )
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

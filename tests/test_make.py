@@ -35,7 +35,7 @@ HOSTILE = (
     "*",
 )
 
-TARGETS = ("help", "setup", "demo", "demo-real", "patient", "plan", "status", "report", "verify")
+TARGETS = ("help", "setup", "demo", "demo-real", "check", "patient", "plan", "status", "report", "verify")
 DEVELOPER_TARGETS = ("test", "lint", "bench", "validate", "clean")
 VARIABLES = ("ID", "CASES", "RESULTS", "PROTOCOL", "SET", "JOBS")
 
@@ -81,7 +81,7 @@ def test_nothing_typed_is_run(checkout: Path, variable: str, way: str) -> None:
 
 
 @pytest.mark.parametrize("way", ["command line", "environment"])
-@pytest.mark.parametrize("target", ["patient", "plan", "report", "verify", "status"])
+@pytest.mark.parametrize("target", ["check", "patient", "plan", "report", "verify", "status"])
 @pytest.mark.parametrize("hostile", HOSTILE)
 def test_id_arrives_letter_by_letter(checkout: Path, hostile: str, target: str, way: str) -> None:
     words, environment = ((f"ID={hostile}",), None) if way == "command line" else ((), {"ID": hostile})
@@ -110,7 +110,14 @@ def test_settings_become_options(checkout: Path) -> None:
     assert arguments(checkout) == expected
 
 
-@pytest.mark.parametrize("target", ["patient", "plan", "report", "verify"])
+@pytest.mark.parametrize("target", ["check", "plan"])
+def test_looking_takes_settings_and_no_number_of_jobs(checkout: Path, target: str) -> None:
+    make(checkout, target, "ID=P001", "SET=sweep.step_deg=2", "JOBS=3")
+    expected = [target, "--set", "sweep.step_deg=2", "--cases", "cases", "--results", "results"]
+    assert arguments(checkout) == [*expected, "--protocol", "clinical", "--", "P001"]
+
+
+@pytest.mark.parametrize("target", ["check", "patient", "plan", "report", "verify"])
 def test_missing_id_is_explained(checkout: Path, target: str) -> None:
     answer = make(checkout, target)
     assert answer.returncode == 2

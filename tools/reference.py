@@ -20,6 +20,8 @@ from pydantic_core import PydanticUndefined
 
 from pipeline.cli import EXIT_CODES, app
 from pipeline.flow import FLOW
+from tests.fault_matrix import ROWS
+from tools.fault_table import marked_tests
 
 CODE = re.compile(r"[ENW]-[A-Z]+-\d\d")
 BOUNDS = {
@@ -42,6 +44,15 @@ SUMMARIES = {
     "E-USE-01": "The command or one of its options is not known, or something is missing.",
 }
 
+
+FAULTS = """\
+A library that reads medical images takes most of what is wrong in silence: of 33 faulty series SimpleITK makes a
+volume of 32. This program refuses, warns of or notes each of them but two, which nothing but a list of checksums
+(`SHA256SUMS`, as `sha256sum` writes it, in the case folder or in `ct/`) can show; such a list is held against the
+files where there is one (`tests/files/test_faulty_series.py`). Foreign files are read in a process of its own,
+without network, without other files, with limits of memory and time: one that breaks a decoder costs its own case.
+
+Every row is shown by tests: `make faults` runs them, `make fuzz` mutates files a hundred times as often."""
 
 FLOW_START, FLOW_END = "<!-- flow: written by `make docs` -->", "<!-- end of flow -->"
 PIPELINE_README = Path(__file__).parents[1] / "pipeline" / "README.md"
@@ -68,7 +79,12 @@ def _with_flow(text: str) -> str:
 
 def pages() -> dict[str, str]:
     """File name -> text of every reference page."""
-    return {"commands.md": commands_page(), "settings.md": settings_page(), "messages.md": messages_page()}
+    return {
+        "commands.md": commands_page(),
+        "settings.md": settings_page(),
+        "messages.md": messages_page(),
+        "faults.md": faults_page(),
+    }
 
 
 def commands_page() -> str:
@@ -111,6 +127,16 @@ def messages_page() -> str:
     ]
     lines += _table("code", "wording")
     lines += [_row(code, "<br>".join(sorted(text for text in wording[code] if text))) for code in sorted(wording)]
+    return _page(lines)
+
+
+def faults_page() -> str:
+    """What may be wrong with a case and what then happens, with the number of tests that show it."""
+    marked = marked_tests()
+    lines = [NOTE, "", "# What may be wrong with a case", "", FAULTS, ""]
+    lines += _table("row", "fault", "what happens", "what it cannot see", "tests")
+    for name, row in ROWS.items():
+        lines.append(_row(name, row.fault, row.outcome, row.limit, len(marked[name])))
     return _page(lines)
 
 

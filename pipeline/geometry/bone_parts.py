@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from pipeline.geometry.volume import CtVolume, Mask, cavities
+from pipeline.geometry.volume import CtVolume, Mask, averaged, cavities
 from pipeline.records import Side
 
 Float = NDArray[np.float64]
@@ -318,22 +318,6 @@ def _with_worn(markers: Labels, knee: Knee, numbers: NDArray[np.integer], own_vo
         if bone is not None:
             out[numbers == bone.number] = BONE_LABELS[name]
     return out
-
-
-def averaged(ct: CtVolume, voxel_mm: float) -> tuple[Float32, Float, tuple[int, int, int]]:
-    """Means over blocks of voxels up to the size asked for: values, (4, 4) matrix, voxels in a block."""
-    i, j, k = (max(int(voxel_mm / step + 1e-6), 1) for step in ct.spacing_mm)
-    values = ct.values.astype(np.float32)
-    for axis, factor in enumerate((i, j, k)):
-        begins = np.arange(0, values.shape[axis], factor)
-        counts = np.diff([*begins, values.shape[axis]]).astype(np.float32)
-        sums = np.add.reduceat(values, begins, axis=axis)
-        shape = [-1 if other == axis else 1 for other in range(3)]
-        values = np.asarray(sums / counts.reshape(shape), dtype=np.float32)
-    matrix = ct.lps_from_index.copy()
-    matrix[:3, 3] += matrix[:3, :3] @ ((np.array([i, j, k]) - 1) / 2)
-    matrix[:3, :3] *= [i, j, k]
-    return values, matrix, (i, j, k)
 
 
 def _solid(values: Float32, spacing_mm: Float, fraction: float) -> Mask:

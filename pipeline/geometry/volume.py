@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import permutations
+from itertools import permutations, product
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -159,6 +159,37 @@ def box_of(mask: Mask) -> tuple[slice, slice, slice]:
         raise ValueError("a mask without voxels has no box")
     i, j, k = (slice(int(span[0]), int(span[-1]) + 1) for span in spans)
     return i, j, k
+
+
+def averaged(ct: CtVolume, voxel_mm: float) -> tuple[NDArray[np.float32], Float, tuple[int, int, int]]:
+    """Means over blocks of voxels up to the size asked for, the last of each axis perhaps of fewer.
+
+    Parameters
+    ----------
+    ct : CtVolume
+    voxel_mm : float
+        Largest side of a block, where a voxel is not larger already.
+
+    Returns
+    -------
+    values : (I, J, K) float32
+    lps_from_index : (4, 4) float64
+        Of the centres of whole blocks.
+    blocks : (int, int, int)
+        Voxels in a block along each axis.
+    """
+    i, j, k = (max(int(voxel_mm / step + 1e-6), 1) for step in ct.spacing_mm)
+    begins = [np.arange(0, size, block) for size, block in zip(ct.values.shape, (i, j, k), strict=True)]
+    sums = np.zeros([len(begin) for begin in begins], dtype=np.int32)
+    for a, b, c in product(range(i), range(j), range(k)):  # strided views: a tenth of the time of a reduction
+        part = ct.values[a::i, b::j, c::k]
+        sums[: part.shape[0], : part.shape[1], : part.shape[2]] += part
+    counts = [np.diff([*begin, size]) for begin, size in zip(begins, ct.values.shape, strict=True)]
+    values = (sums / np.einsum("i,j,k->ijk", *counts)).astype(np.float32)
+    matrix = ct.lps_from_index.copy()
+    matrix[:3, 3] += matrix[:3, :3] @ ((np.array([i, j, k]) - 1) / 2)
+    matrix[:3, :3] *= [i, j, k]
+    return values, matrix, (i, j, k)
 
 
 def label_counts(values: NDArray[np.uint16]) -> NDArray[np.int64]:

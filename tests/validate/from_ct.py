@@ -88,6 +88,33 @@ def _swept(case: Path, results: Path) -> RawTable:
 
 
 @cache
+def _stable_without(name: str) -> float:
+    """Share of attitudes with a stable pose where nothing is made: bones alone slide off one another.
+
+    Raises
+    ------
+    RuntimeError
+        When a run ends otherwise than with a table, or with the refusal that everything slid off.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        case = Path(folder) / "cases" / name
+        _ = _leg_case(case, name) if name in LEGS else _case(case, _knee(name), "bones")
+        job = CaseJob(name, case, Path(folder) / "results")
+        settings = load_settings(FLOW, case, "clinical", (*GRID[4:], "contact.missing_surfaces=leave"))
+        outcome = run_case(job, up_to("sweep"), settings, Execution(jobs=2), Silent())
+        if outcome.code == "E-SWP-01" and "slid off" in (outcome.problem or ""):
+            return 0.0
+        if outcome.code is not None:
+            raise RuntimeError(f"{name}: {outcome.code} {outcome.problem}")
+        status = left(job.results, RAW_TABLE).poses.status
+        return float(np.mean(status == Status.OK))
+
+
+def _knee(name: str) -> Knee:
+    return "knee_jam" if name == "knee_jam" else "knee_mr_a"
+
+
+@cache
 def _table(knee: Knee, kind: Kind) -> RawTable:
     with tempfile.TemporaryDirectory() as name:
         return _swept(_case(Path(name) / "cases" / knee, knee, kind), Path(name) / "results")
@@ -97,12 +124,15 @@ def _table(knee: Knee, kind: Kind) -> RawTable:
 def _leg(name: str) -> RawTable:
     """A leg of ../shared/data/legs_ssm: bones as meshes."""
     with tempfile.TemporaryDirectory() as folder:
-        case = Path(folder) / "cases" / name
-        (case / "meshes").mkdir(parents=True)
-        for file in (DATA / "legs_ssm" / name).iterdir():
-            (case / "meshes" / file.name).write_bytes(file.read_bytes())
-        (case / "case.yaml").write_text("side: right\njoint: knee\n")
-        return _swept(case, Path(folder) / "results")
+        return _swept(_leg_case(Path(folder) / "cases" / name, name), Path(folder) / "results")
+
+
+def _leg_case(case: Path, name: str) -> Path:
+    (case / "meshes").mkdir(parents=True)
+    for file in (DATA / "legs_ssm" / name).iterdir():
+        (case / "meshes" / file.name).write_bytes(file.read_bytes())
+    (case / "case.yaml").write_text("side: right\njoint: knee\n")
+    return case
 
 
 def _curve(table: RawTable, name: str) -> Float:
@@ -144,6 +174,14 @@ def _leg_lost(name: str, limit: float) -> Measurement:
     return row
 
 
+def _nothing_made(name: str) -> Measurement:
+    def row() -> Row:
+        where = f"legs_ssm/{name}" if name in LEGS else name
+        return Row(f"{name}_bare_stable", f"{where}, nothing made: stable", _stable_without(name), "", 0.5)
+
+    return row
+
+
 def _differences(knee: Knee, kinds: tuple[Kind, Kind], limits: tuple[float, ...]) -> list[Measurement]:
     return [_difference(knee, kinds, curve, limit) for curve, limit in zip(CURVES, limits, strict=True)]
 
@@ -162,6 +200,7 @@ ROWS: tuple[Measurement, ...] = (
         *_differences("knee_jam", ("bones", "labelled"), (2.5, 7.0, 3.0, 18.0)),
         *(row for kind in KINDS_OF_CT for row in _of_a_scan("knee_mr_a", kind)),
         *(_leg_lost(name, 1.0 if name == "p2sd1" else 0.0) for name in LEGS),
+        *(_nothing_made(name) for name in ("knee_mr_a", "knee_jam", *LEGS)),
     )
     if KNEE_JAM.exists()
     else ()
