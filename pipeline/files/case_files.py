@@ -120,7 +120,8 @@ def _no_segmentation(top: list[str]) -> CaseRejected:
     return CaseRejected(
         "E-IO-15",
         f"The case folder holds neither a CT nor a label map; it holds {', '.join(top[:8]) or 'no files'}.",
-        "Put the DICOM files of the CT into its folder ct, or the segmentation there as labels.nii.gz, labels.nrrd or labels.dcm.",
+        "Put the DICOM files of the CT into its folder ct, or the segmentation there as labels.nii.gz, labels.nrrd or "
+        "labels.dcm.",
     )
 
 
