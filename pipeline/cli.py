@@ -286,6 +286,7 @@ def _flow() -> tuple[Stage, ...]:
 
 
 def _run(request: Request, jobs: int, flow: Sequence[Stage]) -> int:
+    from pipeline.adapters.workers import get_ready
     from pipeline.engine.console import console_listener
     from pipeline.engine.runner import Execution, run_case
     from pipeline.summary import closing, header, report_page
@@ -293,7 +294,8 @@ def _run(request: Request, jobs: int, flow: Sequence[Stage]) -> int:
     settings = request.settings(_flow())
     _say(header(request.case_id, request.protocol, settings))
     listener = console_listener(_write, terminal=sys.stdout.isatty())
-    execution = Execution(jobs or len(os.sched_getaffinity(0)))
+    jobs = jobs or len(os.sched_getaffinity(0))
+    execution = Execution(jobs, get_ready) if jobs > 1 else Execution(jobs)
     outcome = run_case(request.job(), flow, settings, execution, listener)
     _say(*closing(outcome, report_page(request.job().results, flow)))
     return outcome.exit_code

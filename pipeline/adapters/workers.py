@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_all_start_methods, get_context
-from multiprocessing.context import BaseContext
+from multiprocessing import forkserver, get_all_start_methods, get_context
+from multiprocessing.context import BaseContext, ForkServerContext
 from typing import TypeVar
 
 from pipeline.errors import EnvironmentFault
@@ -62,6 +62,12 @@ def map_in_order(
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def get_ready() -> None:
+    """Begin to load what workers use, in the server they are forked from; returns at once."""
+    if isinstance(_context(), ForkServerContext):
+        forkserver.ensure_running()
 
 
 def _context() -> BaseContext:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Protocol
@@ -27,9 +27,18 @@ class CaseJob:
 
 @dataclass(frozen=True)
 class Execution:
-    """What decides how a run goes and never what it gives; ``jobs`` is the number of worker processes."""
+    """What decides how a run goes and never what it gives.
+
+    Attributes
+    ----------
+    jobs : int
+        Worker processes.
+    get_ready : callable
+        Called while a stage with limits works in its own process: begins what later stages need, and returns at once.
+    """
 
     jobs: int
+    get_ready: Callable[[], None] = lambda: None
 
 
 @dataclass(frozen=True)

@@ -197,6 +197,8 @@ def _computed(run: _Run, stage: Stage, shelf: Shelf, found: Lookup) -> Manifest:
         set_aside(folder)
     with _begun(run, stage, shelf) as work:
         run.announce(stage, found.reason)
+        if stage.limits:
+            run.execution.get_ready()
         made = work()
     settings = run.settings[stage.name]
     listed, used = findings_artifact(stage.name), settings_artifact(stage.name)

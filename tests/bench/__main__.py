@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.adapters.workers import get_ready
 from pipeline.artifacts import ANATOMY, MOVING_BODY, REFERENCE_BODY
 from pipeline.config import load_settings
 from pipeline.contact_params import ContactParams
@@ -36,7 +37,7 @@ def patient(case: Path, folder: Path) -> tuple[RunOutcome, RunOutcome, float]:
     job = CaseJob("bench", case, folder / "results")
 
     def process() -> RunOutcome:
-        return run_case(job, FLOW, settings, Execution(jobs=2), Silent())
+        return run_case(job, FLOW, settings, Execution(2, get_ready), Silent())
 
     first = process()
     start = time.perf_counter()

@@ -411,3 +411,26 @@ def test_what_the_system_cannot_seal_is_told_once(
 
 def test_the_flow_is_the_toy_flow() -> None:
     assert [stage.name for stage in confined_flow()] == [stage.name for stage in FLOW]
+
+
+def test_what_later_stages_need_is_begun_while_the_child_works(job: CaseJob) -> None:
+    """The child waits for what its parent begins meanwhile; a cached run begins nothing."""
+    signs = job.source / ".begun"  # hidden, so no part of the case
+    begun: list[bool] = []
+
+    def body(reads: Inputs, params: Any, out: Outputs) -> Findings:
+        until = time.monotonic() + 10.0
+        while not signs.exists() and time.monotonic() < until:
+            time.sleep(0.01)
+        assert signs.exists()
+        return GATHER.run(reads, params, out)
+
+    def get_ready() -> None:
+        begun.append(True)
+        signs.touch()
+
+    for expected in (["ran"] * 3, ["cached"] * 3):
+        outcome = run_case(job, confined_flow(body), DEFAULTS, Execution(1, get_ready), Recorder())
+        assert states(outcome) == expected
+        signs.unlink(missing_ok=True)
+    assert begun == [True]
