@@ -24,6 +24,7 @@ from pipeline.contact_params import ContactParams, fibres_of
 from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage
 from pipeline.errors import CaseRejected
 from pipeline.kinematics.body_frames import scan_pose
+from pipeline.kinematics.contact import Pose
 from pipeline.kinematics.cross_check import Differences, agreeing, differences, rechecks, shallower
 from pipeline.kinematics.direct.settings import DirectSettings, MapSettings
 from pipeline.kinematics.incremental import IncrementalSettings, StablePose
@@ -62,6 +63,9 @@ class Params(ContactParams):
     rotation_resolution_deg: float = Field(0.1, gt=0, le=5, description="step at which a rotation is spent")
     slide_bound_mm: float = Field(30.0, gt=0, le=200, description="farther than this from the scan pose: slid off")
     rotation_bound_deg: float = Field(30.0, gt=0, le=179, description="farther than this from the scan pose: bound")
+    rest_rotation_deg: float = Field(
+        180.0, ge=0, le=180, description="a scan turned farther counts as turned by this much: begin and bounds"
+    )
     max_motions: int = Field(400, ge=10, le=100_000, description="incremental: motions after which a cell is given up")
     classic: bool = Field(default=False, description="incremental: the paper's plain rules, not only deeper")
     ligaments: bool = Field(default=False, description="let the fibres of ligaments.csv pull")
@@ -114,18 +118,18 @@ def _values(low: float, high: float, step: float) -> np.ndarray[tuple[int], np.d
 def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     """Sweep the grid."""
     anatomy, grid = reads[ANATOMY], params.grid()
-    scan = scan_pose(anatomy.scan_attitude)
+    rest = _at_rest(scan_pose(anatomy.scan_attitude), params.rest_rotation_deg)
     pair = params.pair(reads[REFERENCE_BODY], reads[MOVING_BODY], anatomy)
     fibres = fibres_of(_wanted(reads, params), anatomy, pair, params.ligament_push_n, params.reference_strain_fraction)
     joint = Joint(pair, replace(_settings(params), fibres=fibres), out.jobs)
     progress = _Progress(out, int(np.prod(grid.shape)) + grid.shape[0])
-    ways = walk_grid(grid, anatomy.scan_attitude[:2], scan, lambda walks: joint.walk(walks, progress.of(walks)))
+    ways = walk_grid(grid, anatomy.scan_attitude[:2], rest, lambda walks: joint.walk(walks, progress.of(walks)))
     found, limits = kept(ways), JumpLimits(params.jump_mm, params.jump_deg)
     before = jumps(grid, found, limits)
-    found = mended(found, lambda now: to_solve_again(grid, now, limits, scan), joint.solve_again, params.jump_rounds)
+    found = mended(found, lambda now: to_solve_again(grid, now, limits, rest), joint.solve_again, params.jump_rounds)
     if not any(one.stable.status.usable for one in found.values()):
         raise _nothing_stable(found)
-    asked = rechecks(grid, found, params.cross_check_fraction, scan)
+    asked = rechecks(grid, found, params.cross_check_fraction, rest)
     known = joint.certify(grid, found)
     claimed = claims(grid, found, known)
     proven, answers = joint.prove(tuple(claimed.values()), asked)
@@ -133,7 +137,7 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     table = assemble(grid, found, Evidence(known, proofs), hysteresis(grid, ways))
     out[RAW_TABLE] = table
     out[SCAN_RETURNS] = _scan_returns(anatomy, params, joint)
-    out[NEUTRAL_CURVE] = joint.neutral(table, anatomy.scan_attitude[1], scan)
+    out[NEUTRAL_CURVE] = joint.neutral(table, anatomy.scan_attitude[1], rest)
 
     out[SWEEP_FACTS] = facts = _facts(params, (before, jumps(grid, found, limits)), differences(found, asked, answers))
     return _findings(table, facts)
@@ -158,6 +162,12 @@ def _nothing_stable(found: Mapping[Place, Found]) -> CaseRejected:
         f"No stable pose at any of {len(ends)} flexions at the varus of the scan: {_counts(ends)}.",
         "Check that cartilage and menisci are labelled, and that the bones are those of one joint.",
     )
+
+
+def _at_rest(scan: Pose, most_deg: float) -> Pose:
+    """The scan pose, its rotation taken to that of a joint at rest: a twisted scan is no middle of its bounds."""
+    most = float(np.radians(most_deg))
+    return scan._replace(theta=min(max(scan.theta, -most), most))
 
 
 def _scan_returns(anatomy: Anatomy, params: Params, joint: Joint) -> tuple[ScanReturn, ...]:

@@ -231,6 +231,22 @@ def test_bounds_are_about_the_scan(solver: str) -> None:
     swept_with(solver=solver, slide_bound_mm=0.45 + PLACE_MM)
 
 
+@pytest.mark.parametrize(
+    ("scanned_deg", "most_deg", "begun_deg"), [(40, 180, 40), (40, 12, 12), (-40, 12, -12), (9, 12, 9)]
+)
+def test_a_twisted_scan_begins_as_a_joint_at_rest(scanned_deg: float, most_deg: float, begun_deg: float) -> None:
+    """A ball turns freely, so it keeps the rotation that it began with."""
+    attitude = (8.0, 1.0, float(scanned_deg), 0.4, -0.2, 5.5)
+    moving = scanned(SCAN_FROM_REFERENCE, attitude)
+    given = inputs(ball()) | {
+        MOVING_BODY.name: transformed(ball(), moving),
+        ANATOMY.name: anatomy(SCAN_FROM_REFERENCE, moving, attitude),
+    }
+    run = Run(STAGE, given)
+    run.go(Params(**{**SMALL, "rest_rotation_deg": float(most_deg)}))
+    np.testing.assert_allclose(run[RAW_TABLE].poses.internal_rotation_deg, begun_deg, atol=6.0)
+
+
 PAPER: dict[str, Any] = {
     "flexion_max_deg": 0.0,
     "varus_min_deg": 0.0,
