@@ -74,14 +74,15 @@ def _smoothed(raw: RawTable, degree_varus: int, params: Params, joint: Joint) ->
         ) from error
     cells = _in_rows(_cells(joint, entries(raw, fits, params.fill_gap_deg)), raw.grid)
     poses, contact_error = pose_table(cells), np.array([[_contact_error(cell.proof) for cell in row] for row in cells])
-    midpoint_error = _midpoint_errors(raw.grid, poses, joint)
+    between = _half_way(raw.grid, poses)
+    contact_mm = _contact_depths(raw.grid, between, joint)
     push = shared_error(
-        raw.grid, usable_entries(poses), midpoint_error, params.midpoint_aim_mm, params.entry_allowance_mm
+        raw.grid, usable_entries(poses), contact_mm - between[..., 2], params.midpoint_aim_mm, params.entry_allowance_mm
     )
-    if push.any():
+    if push.any():  # along delta alone: contact stays where it is
         poses = replace(poses, proximal_mm=poses.proximal_mm + push)
         contact_error = np.where(push == 0.0, contact_error, _outermost(contact_error, -push))
-        midpoint_error = _midpoint_errors(raw.grid, poses, joint)
+        between = _half_way(raw.grid, poses)
     return SmoothTable(
         grid=raw.grid,
         poses=poses,
@@ -89,7 +90,7 @@ def _smoothed(raw: RawTable, degree_varus: int, params: Params, joint: Joint) ->
         flexion_range_deg=ends(raw.grid.flexion_deg),
         varus_range_deg=ends(raw.grid.varus_deg),
         contact_error_mm=contact_error,
-        midpoint_error_mm=midpoint_error,
+        midpoint_error_mm=contact_mm - between[..., 2],
     )
 
 
@@ -136,16 +137,25 @@ def _contact_error(proof: Proof) -> float:
     return proof.gap_after_mm if proof.gap_before_mm == 0.0 else -proof.gap_before_mm
 
 
-def _midpoint_errors(grid: Grid, poses: PoseTable, joint: Joint) -> Float:
-    """(F - 1, V) signed way to contact half-way between entries, as a reader interpolates; NaN where not covered."""
+def _half_way_deg(grid: Grid) -> Float:
+    """(F - 1, V, 2) flexion and varus in the middle between entries that follow one another in flexion."""
     flexion = 0.5 * (grid.flexion_deg[1:] + grid.flexion_deg[:-1])
-    angles = np.stack(np.meshgrid(flexion, grid.varus_deg, indexing="ij"), axis=-1)
-    found = found_at(pose_curves(grid, poses), angles[..., 0], angles[..., 1])
-    error = np.full(found.shape[:2], np.nan)
-    covered = np.isfinite(found).all(axis=-1)
-    probes = [_probe(attitude, pose) for attitude, pose in zip(angles[covered], found[covered], strict=True)]
-    error[covered] = joint.ways_to_contact(probes)
-    return error
+    return np.stack(np.meshgrid(flexion, grid.varus_deg, indexing="ij"), axis=-1)
+
+
+def _half_way(grid: Grid, poses: PoseTable) -> Float:
+    """(F - 1, V, 4) found coordinates there, as a reader interpolates them; NaN where not covered."""
+    angles = _half_way_deg(grid)
+    return found_at(pose_curves(grid, poses), angles[..., 0], angles[..., 1])
+
+
+def _contact_depths(grid: Grid, between: Float, joint: Joint) -> Float:
+    """(F - 1, V) depth of first contact at the place and rotation of each such pose; NaN where not covered."""
+    depth, covered = np.full(between.shape[:2], np.nan), np.isfinite(between).all(axis=-1)
+    places = zip(_half_way_deg(grid)[covered], between[covered], strict=True)
+    probes = [_probe(attitude, pose) for attitude, pose in places]
+    depth[covered] = between[covered, 2] + joint.ways_to_contact(probes)
+    return depth
 
 
 def _probe(attitude: Float, found: Float) -> Probe:
