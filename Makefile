@@ -34,7 +34,7 @@ LOOK = || [ $$? -eq 11 ]
 NEED_ID = if [ -z "$$ID" ]; then echo "Which case? Type: make $@ ID=P001" >&2; exit 20; fi
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo demo-real check patient plan status report verify test lint format faults fuzz bench \
+.PHONY: help setup setup-dev demo demo-real check patient plan status report verify test lint format faults fuzz test-browser test-exports bench \
 	validate docs lock clean
 
 help:  ## show this list
@@ -92,6 +92,16 @@ faults: setup-dev  ## run the tests of what may be wrong with a case (docs/fault
 
 fuzz: setup-dev  ## mutate scanner files more than a hundred times as often as the tests do; nothing may break out
 	@HOSTILE_MUTATIONS=1000 $(BIN)/python -P -m pytest tests/end_to_end/test_hostile_files.py -k "flipped or spoilt"
+
+test-browser: setup-dev  ## look at the viewer of the report in Chromium (skips without one)
+	@$(BIN)/python -P -m pytest tests/players/test_browser.py
+
+test-exports: setup-dev  ## put the exports before the validators of their worlds (needs npm; OpenSim's wheel is 200 MB)
+	@npm install --silent --prefix build/validators gltf-validator
+	@[ -x build/validators/osim/bin/python ] || $(PYTHON) -m venv build/validators/osim
+	@build/validators/osim/bin/pip install --quiet opensim
+	@CT2LUT_NODE_MODULES=build/validators/node_modules CT2LUT_OPENSIM_PYTHON=build/validators/osim/bin/python \
+		$(BIN)/python -P -m pytest tests/exports
 
 bench: setup-dev  ## measure speed
 	@$(BIN)/python -m tests.bench

@@ -238,6 +238,56 @@ def lookup(
 
 
 @app.command()
+def export(
+    case_id: CaseId,
+    results: Results = DEFAULT_RESULTS,
+    formats: Annotated[str, typer.Option("--format", help="Formats, separated by commas; all by default.")] = "",
+    out: Annotated[Path, typer.Option("--out", help="Folder for the files.")] = Path("export"),
+) -> None:
+    """Write the table of a finished case for other programs.
+
+    glb (AR/VR), json, osim (OpenSim), slicer (3D Slicer); every package holds them too.
+
+    Example: ct2lut export P001 --format glb,json --out P001_vr
+    """
+    from pipeline.exports import export_files, source_of
+
+    folder = results / check_case_id(case_id) / "90_package"
+    if not (folder / "manifest.json").is_file():
+        raise ConfigError("E-EXP-01", f"{case_id} has no finished package yet.", f"Run it first: ct2lut run {case_id}.")
+    package = {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    try:
+        files = export_files(source_of(package), [name for name in formats.split(",") if name] or None)
+    except ValueError as error:
+        raise ConfigError("E-EXP-02", f"{error}.", "Name other formats, or run the case again.") from error
+    for name, data in files.items():
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_bytes(data)
+    _say(*(f"{out / name}  {len(data) / 1e6:.2f} MB" for name, data in files.items()))
+
+
+@app.command()
+def compare(
+    first: Annotated[str, typer.Argument(metavar="A", help="A finished case, or the path of a lut.h5.")],
+    second: Annotated[str, typer.Argument(metavar="B", help="Another; the other side, or an earlier study.")],
+    results: Results = DEFAULT_RESULTS,
+    out: Annotated[Path, typer.Option("--out", help="The page to write.")] = Path("comparison.html"),
+) -> None:
+    """Compare two tables: the differences of each curve, and one page with both.
+
+    Signs are clinical, so a left and a right knee compare directly.
+
+    Example: ct2lut compare P001 P002 --out comparison.html
+    """
+    from pipeline.report.comparison_page import comparison_html
+    from pipeline.two_tables import compare_cases, comparison_lines
+
+    page = compare_cases(first, second, results)
+    out.write_bytes(comparison_html(page))
+    _say(*comparison_lines(page), f"page: {out}")
+
+
+@app.command()
 def phantom(
     folder: Annotated[Path, typer.Argument(metavar="CASES", help="Folder with one folder a case.")],
     case_id: Annotated[str, typer.Option("--id", help="Name of the new case.")] = "phantom",

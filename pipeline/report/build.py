@@ -1,4 +1,4 @@
-"""The report page: one self-contained HTML file without script, the same bytes for the same result."""
+"""The report page: one self-contained HTML file, the same bytes for the same result."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from pipeline.engine.stage import Findings
 from pipeline.records import CaseFacts, SurfaceOrigin, Verdict
 from pipeline.report.evidence import CURVES, STATUS_WORDS, Evidence, cell, neutral_varus, plain, shown_flexions
 from pipeline.report.figure_frame import RESEARCH_USE
+from pipeline.report.figure_viewer import content_policy, scripts, viewer_data
 from pipeline.report.figures import Drawn
 from pipeline.report.settings import PictureSettings
 
@@ -55,13 +56,16 @@ def report_files(page: Page) -> dict[str, bytes]:
 def report_html(page: Page) -> bytes:
     """The page with its pictures embedded; every text from a case is escaped."""
     import jinja2  # noqa: PLC0415  - a cached run does not need it
+    import markupsafe  # noqa: PLC0415  - the same
 
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(_resource), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
     )
     environment.filters["plain"] = plain
     environment.filters["number"] = number
-    return environment.get_template(TEMPLATE).render(**_context(page)).encode()
+    # our own constant files; every text from a case goes through the escaping of the template
+    library, module = (markupsafe.Markup(text) for text in scripts())  # noqa: S704
+    return environment.get_template(TEMPLATE).render(**_context(page), library=library, module=module).encode()
 
 
 def _resource(name: str) -> str:
@@ -72,6 +76,8 @@ def _context(page: Page) -> dict[str, Any]:
     evidence = page.evidence
     return {
         "style": STYLE,
+        "policy": content_policy(scripts()),
+        "viewer": viewer_data(evidence, page.settings),
         "research_use": RESEARCH_USE,
         "software": f"ct2lut {__version__}",
         "packages": [(name, metadata.version(name)) for name in PACKAGES],

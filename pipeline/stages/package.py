@@ -27,6 +27,7 @@ from pipeline.artifacts import (
 )
 from pipeline.engine.records import canonical_json
 from pipeline.engine.stage import Findings, Inputs, Outputs, Stage, StrictParams, findings_of, settings_of
+from pipeline.exports import ExportSource, export_files
 from pipeline.files.archive import encode_zip
 from pipeline.files.csv_table import encode_csv
 from pipeline.files.lut_content import LutFileContent
@@ -54,12 +55,16 @@ What is here
   images/         the pictures of the report, one file each
   lut.h5          the table for programs: poses, contact bodies, frames, proofs (HDF5, format version 1)
   lut.csv         the table for people: one row an attitude
+  lut.json        the table for programs without HDF5, with poses to check a reader by; described by lut.schema.json
+  {joint}.glb        AR/VR and web: lighter meshes and one animation for each varus (metres, Y up)
+  opensim/        joint.osim: the joint as a function of flexion and varus, and its geometry (metres)
+  slicer/         3D Slicer: landmarks, and poses every 30 degrees of flexion
   meshes/         every structure as PLY and as STL, as scanned
   manifest.json   versions, verdict, findings, SHA-256 of the input and of every file here
 
 Space and signs
   Meshes, bodies and 4x4 matrices are in the space of the scan: LPS (DICOM patient space: x to the patient's left,
-  y posterior, z superior), millimetres, column vectors.
+  y posterior, z superior), millimetres, column vectors. {joint}.glb and opensim/ have spaces of their own, and say so.
   Flexion +, varus +, internal rotation of the {moving} +, for a right and for a left joint alike.
   lut/moved_from_scan[i, j] takes the moving body ({moving}) from where it was scanned to its stable place at
   grid/flexion_deg[i], grid/varus_deg[j]. The reference body ({reference}) does not move.
@@ -91,11 +96,10 @@ class Params(StrictParams):
 def run(reads: Inputs, params: Params, out: Outputs) -> Findings:  # noqa: ARG001 - the stage contract
     """Put the deliverable together; it adds no finding of its own."""
     facts = reads[CASE_FACTS]
-    files = {"lut.h5": encode_lut(_content(reads)), "README.txt": _readme(facts, reads[SURFACE_ORIGINS])}
-    smooth = reads[SMOOTH_TABLE]
-    files["lut.csv"] = encode_csv(smooth.grid, smooth.poses, facts.side)
-    meshes, report = reads[MESHES] | reads[MADE_MESHES], reads[REPORT]
-    files |= {**_mesh_files(meshes), **report}
+    content, meshes, report = _content(reads), reads[MESHES] | reads[MADE_MESHES], reads[REPORT]
+    files = {"lut.h5": encode_lut(content), "README.txt": _readme(facts, reads[SURFACE_ORIGINS])}
+    files["lut.csv"] = encode_csv(content.smooth.grid, content.smooth.poses, facts.side)
+    files |= {**_mesh_files(meshes), **export_files(_source(reads, content, meshes)), **report}
     files["manifest.json"] = canonical_json(_manifest(reads, files))
     archive = f"{facts.case_id}_ct2lut"
     out[PACKAGE] = {**files, f"{archive}.zip": encode_zip(files, archive)}
@@ -118,6 +122,12 @@ def _content(reads: Inputs) -> LutFileContent:
         reference_body=reads[REFERENCE_BODY],
         moving_body=reads[MOVING_BODY],
     )
+
+
+def _source(reads: Inputs, content: LutFileContent, meshes: Mapping[str, TriangleMesh]) -> ExportSource:
+    bodies = {one.structure: one.body for one in reads[SURFACE_ORIGINS] if one.origin != "absent"}
+    landmarks = {one.name: one.position for one in reads[ANATOMY].landmarks}
+    return ExportSource(content, meshes, bodies, landmarks)
 
 
 def _mesh_files(meshes: Mapping[str, TriangleMesh]) -> dict[str, bytes]:

@@ -34,6 +34,7 @@ from pipeline.errors import EnvironmentFault
 from pipeline.report.build import STYLE, TEMPLATE, Page, report_files
 from pipeline.report.evidence import Evidence
 from pipeline.report.figure_slices import ct_cuts
+from pipeline.report.figure_viewer import VIEWER_FILES
 from pipeline.report.figures import Drawn, drawn, expected_figures
 from pipeline.report.metrics import all_metrics
 from pipeline.report.settings import Limits, PictureSettings
@@ -127,5 +128,5 @@ STAGE = Stage(
     writes=(VERDICT, REPORT),
     Params=Params,
     run=run,
-    resources=(f"pipeline.report:{TEMPLATE}", f"pipeline.report:{STYLE}"),
+    resources=tuple(f"pipeline.report:{name}" for name in (TEMPLATE, STYLE, *VIEWER_FILES)),
 )

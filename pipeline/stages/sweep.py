@@ -23,6 +23,7 @@ from pipeline.artifacts import (
 from pipeline.contact_params import ContactParams, fibres_of
 from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage
 from pipeline.errors import CaseRejected
+from pipeline.kinematics.baselines import hinge, probes, walker
 from pipeline.kinematics.body_frames import scan_pose
 from pipeline.kinematics.contact import Pose
 from pipeline.kinematics.cross_check import Differences, agreeing, differences, rechecks, shallower
@@ -79,6 +80,9 @@ class Params(ContactParams):
     jump_deg: float = Field(3.0, gt=0, le=45, description="the same for the rotation")
     jump_rounds: int = Field(1, ge=0, le=20, description="how often jumps are solved again from all sides")
     cross_check_fraction: float = Field(0.05, ge=0, le=1, description="share of cells that the other solver solves too")
+    baselines: bool = Field(
+        default=False, description="say how a plain hinge and a published average motion would fit these bones"
+    )
     scan_shift_mm: float = Field(
         2.0, ge=0, le=20, description="how far from the scan pose the body is let go, as a test"
     )
@@ -140,7 +144,7 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     out[NEUTRAL_CURVE] = joint.neutral(table, anatomy.scan_attitude[1], rest)
 
     out[SWEEP_FACTS] = facts = _facts(params, (before, jumps(grid, found, limits)), differences(found, asked, answers))
-    return _findings(table, facts)
+    return (*_findings(table, facts), *(_baselines(joint, anatomy, grid) if params.baselines else ()))
 
 
 def _wanted(reads: Inputs, params: Params) -> tuple[LigamentFibre, ...]:
@@ -256,6 +260,20 @@ def _facts(params: Params, jumped: tuple[Jumps, Jumps], different: Differences) 
             shallower_mm=float((-different.deeper_mm).max(initial=0.0)),
         ),
     )
+
+
+def _baselines(joint: Joint, anatomy: Anatomy, grid: Grid) -> Findings:
+    """What motions that ignore the shape of the joint would cost on these bones."""
+    words = []
+    for name, baseline in (
+        ("a plain hinge about the flexion axis", hinge(grid.flexion_deg, anatomy.scan_attitude)),
+        ("Walker's published average motion", walker(grid.flexion_deg, anatomy.scan_attitude)),
+    ):
+        ways = np.array(joint.ways_to_contact(probes(baseline)))
+        overlap, gap = float(np.nanmax(-ways, initial=0.0)), float(np.nanmax(ways, initial=0.0))
+        words.append(f"{name} would overlap by up to {overlap:.1f} mm and gape by up to {gap:.1f} mm")
+    message = f"For comparison, on these bones and from the pose of the scan: {'; '.join(words)}."
+    return (Finding("N-SWP-04", Severity.NOTE, message),)
 
 
 def _counts(ends: Sequence[int]) -> str:

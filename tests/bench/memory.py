@@ -8,7 +8,7 @@ from pathlib import Path
 from types import TracebackType
 
 PAGE_MB = os.sysconf("SC_PAGE_SIZE") / 1e6
-EVERY_S = 0.05
+EVERY_S = 0.2
 
 
 class PeakMemory:

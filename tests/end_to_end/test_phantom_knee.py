@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline import cli
 from pipeline.engine.outcome import RunOutcome
 from pipeline.errors import ExitCode
 from pipeline.flow import FLOW
@@ -86,6 +87,30 @@ def test_a_stranger_can_verify_the_package(done: Done) -> None:
     report = json.loads(answer.stdout)
     assert report["holds"]
     assert max(report["midpoints"]["worst_gap_mm"], report["midpoints"]["worst_intersection_mm"]) < 0.145
+
+
+def test_exports_are_made_again_from_the_package_alone(
+    done: Done, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results = str(done.results.parent)
+    assert cli.execute(["export", done.results.name, "--results", results, "--out", str(tmp_path)]) == ExitCode.PASS
+    made = files_of(tmp_path)
+    assert {"knee.glb", "lut.json", "lut.schema.json", "opensim/joint.osim"} <= made.keys()
+    assert made.items() <= files_of(done.package).items()
+    assert "knee.glb" in capsys.readouterr().out
+    assert cli.execute(["export", done.results.name, "--results", results, "--format", "stl"]) == ExitCode.USAGE
+    assert capsys.readouterr().err.startswith("E-EXP-02  unknown format 'stl'")
+    assert cli.execute(["export", "P999", "--results", results]) == ExitCode.USAGE
+    assert capsys.readouterr().err.startswith("E-EXP-01  P999 has no finished package yet.")
+
+
+def test_a_table_compared_with_itself(done: Done, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "page.html"
+    table = str(done.package / "lut.h5")
+    arguments = ["compare", done.results.name, table, "--results", str(done.results.parent), "--out", str(page)]
+    assert cli.execute(arguments) == ExitCode.PASS
+    assert capsys.readouterr().out.count(" RMS    0.00") == 4
+    assert page.read_bytes().startswith(b"<!DOCTYPE html>")
 
 
 def test_playback_moves_the_tibia_and_keeps_it_rigid(done: Done) -> None:

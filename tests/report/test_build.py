@@ -1,8 +1,10 @@
-"""The page: self-contained, inert, complete, and the same bytes every time."""
+"""The page: self-contained, nothing runs but our own scripts, complete, and the same bytes every time."""
 
 from __future__ import annotations
 
 import base64
+import hashlib
+import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -16,6 +18,7 @@ from pipeline.kinematics.table import Status
 from pipeline.records import Side, SurfaceOrigin
 from pipeline.report.build import Page, number, report_files, report_html, table_rows
 from pipeline.report.evidence import Evidence
+from pipeline.report.figure_viewer import viewer_data
 from pipeline.report.figures import Drawn, expected_figures
 from pipeline.report.metrics import all_metrics
 from pipeline.report.settings import Limits, PictureSettings
@@ -75,15 +78,45 @@ def test_every_expected_picture_is_embedded_with_its_four_lines() -> None:
         assert tags.text.count(line) == 6
 
 
-def test_nothing_is_loaded_and_nothing_runs() -> None:
+SCRIPT = re.compile(r"<script([^>]*)>(.*?)</script>", re.DOTALL)
+#: A name of the language of documents, not an address that is asked.
+NAMESPACE = "http://www.w3.org/1999/xhtml"
+
+
+def test_nothing_is_loaded_and_only_our_own_scripts_run() -> None:
     text = html(sample_evidence())
     tags = Tags(text).tags
+    hashes = [
+        base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
+        for kind, code in SCRIPT.findall(text)
+        if "application/json" not in kind
+    ]
     policy = [attributes.get("content") for tag, attributes in tags if attributes.get("http-equiv")]
-    assert policy == ["default-src 'none'; img-src data:; style-src 'unsafe-inline'"]
-    assert not {"script", "link", "iframe", "object", "embed", "form", "base", "a"} & {tag for tag, _ in tags}
+    strict = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src"
+    assert policy == [f"{strict} 'sha256-{hashes[0]}' 'sha256-{hashes[1]}'"]
+    scripts = [attributes for tag, attributes in tags if tag == "script"]
+    assert scripts == [{"type": "application/json", "id": "viewer-data"}, {}, {"type": "module"}]
+    assert not {"link", "iframe", "object", "embed", "form", "base", "a"} & {tag for tag, _ in tags}
     addresses = [v or "" for _, attributes in tags for name, v in attributes.items() if name in ("src", "href")]
     assert all(address.startswith("data:image/png;base64,") for address in addresses)
-    assert not re.search(r"https?://|@import|url\(", text)
+    assert set(re.findall(r"https?://[\w./]+", text)) <= {NAMESPACE}
+    assert not re.search(r"@import|url\(", SCRIPT.sub("", text))
+
+
+def test_the_model_of_the_page_is_that_of_the_case() -> None:
+    evidence = sample_evidence("left", "CASE-7")
+    data = next(json.loads(code) for kind, code in SCRIPT.findall(html(evidence)) if "application/json" in kind)
+    assert data == viewer_data(evidence, PictureSettings())
+    assert data["heading"] == "Case CASE-7  |  LEFT knee (L)"
+
+
+def test_without_script_a_sentence_stands_in_place_of_the_model() -> None:
+    tags = Tags(html(sample_evidence()))
+    assert [attributes for _, attributes in tags.tags if attributes.get("class") == "on"] == [
+        {"class": "on", "hidden": None}
+    ]
+    assert [attributes for _, attributes in tags.tags if attributes.get("class") == "off"] == [{"class": "off"}]
+    assert "needs a browser with JavaScript and WebGL 2" in tags.text
 
 
 def test_hostile_text_is_shown_and_not_obeyed() -> None:
@@ -97,7 +130,8 @@ def test_hostile_text_is_shown_and_not_obeyed() -> None:
         findings={"intake": (Finding("W-X-01", Severity.REVIEW, HOSTILE),)},
     )
     text = html(spoiled, bones=HOSTILE)
-    assert [tag for tag, _ in Tags(text).tags if tag in ("script", "img")] == ["img"] * 5
+    assert [tag for tag, _ in Tags(text).tags if tag in ("script", "img")] == ["img"] * 5 + ["script"] * 3
+    assert HOSTILE in next(json.loads(code) for kind, code in SCRIPT.findall(text) if "json" in kind)["heading"]
     assert not [name for _, attributes in Tags(text).tags for name in attributes if name.startswith("on")]
     assert Tags(text).text.count(HOSTILE) >= 6
     assert "{{ 7 * 7 }}" in text

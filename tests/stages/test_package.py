@@ -31,10 +31,11 @@ from pipeline.artifacts import (
 )
 from pipeline.engine.artifacts import Artifact
 from pipeline.engine.stage import Finding, Severity
+from pipeline.exports import export_files, source_of
 from pipeline.files.lut_content import LutFileContent
 from pipeline.files.lut_file import decode_lut
 from pipeline.playback import Lut
-from pipeline.records import Anatomy, CaseFacts, Side, SurfaceOrigin, Verdict
+from pipeline.records import Anatomy, CaseFacts, Landmark, Side, SurfaceOrigin, Verdict
 from pipeline.stages.package import STAGE, Params
 from tests.files.lut_sample import content
 
@@ -121,7 +122,7 @@ def _facts(side: Side) -> CaseFacts:
 def _anatomy(table: LutFileContent, side: Side) -> Anatomy:
     return Anatomy(
         side=side,
-        landmarks=(),
+        landmarks=(Landmark("lateral_epicondyle", (150.0, -80.0, 650.0), 3.0, "found"),),
         axes=(),
         scan_from_reference=tuple(map(tuple, table.scan_from_reference.tolist())),
         scan_from_moving=tuple(map(tuple, table.scan_from_moving.tolist())),
@@ -148,14 +149,24 @@ def test_the_deliverable_is_complete(files: dict[str, bytes]) -> None:
         "README.txt",
         "P001_ct2lut.zip",
         "images/poses.png",
+        "knee.glb",
         "lut.csv",
         "lut.h5",
+        "lut.json",
+        "lut.schema.json",
         "manifest.json",
         "meshes/femur.ply",
         "meshes/femur.stl",
         "meshes/tibia.ply",
         "meshes/tibia.stl",
+        "opensim/Geometry/femur.stl",
+        "opensim/Geometry/tibia.stl",
+        "opensim/joint.osim",
         "report.html",
+        "slicer/landmarks.mrk.json",
+        "slicer/tibia_flexion_0_varus_0.tfm",
+        "slicer/tibia_flexion_30_varus_0.tfm",
+        "slicer/tibia_flexion_60_varus_0.tfm",
     }
 
 
@@ -195,6 +206,20 @@ def test_the_table_is_that_of_the_stages_before(side: Side) -> None:
     np.testing.assert_array_equal(read.neutral.varus_deg, expected.neutral.varus_deg)
     np.testing.assert_array_equal(read.scan_from_moving, expected.scan_from_moving)
     np.testing.assert_array_equal(read.moving_body.points, expected.moving_body.points)
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_the_package_alone_makes_its_exports_again(side: Side) -> None:
+    files = package(side)
+    again = export_files(source_of(files))
+    assert again == {name: files[name] for name in again}
+    assert b"lateral_epicondyle" in again["slicer/landmarks.mrk.json"]
+
+
+def test_the_readme_names_every_file(files: dict[str, bytes]) -> None:
+    text = files["README.txt"].decode()
+    tops = {name.partition("/")[0] + ("/" if "/" in name else "") for name in files}
+    assert not [top for top in tops - {"README.txt", "P001_ct2lut.zip"} if top not in text]
 
 
 def test_the_example_of_the_readme_runs(
