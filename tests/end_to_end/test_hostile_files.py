@@ -321,8 +321,8 @@ def test_a_signal_leaves_no_process(tmp_path: Path, number: signal.Signals) -> N
         process.communicate(timeout=20)
     assert time.monotonic() - started < 5
     assert process.returncode == (-signal.SIGKILL if number == signal.SIGKILL else ExitCode.INTERRUPTED)
-    assert len(children) == 1
-    while Path(f"/proc/{children[0]}").exists():
+    assert children  # what reads the case, and what gets ready for later stages
+    while any(Path(f"/proc/{child}").exists() for child in children):
         assert time.monotonic() < deadline
         time.sleep(0.02)
 
