@@ -156,9 +156,8 @@ def confined(confinement: Confinement, work: Callable[[Channel], Made]) -> Itera
     try:
         _start(process)
         there.close()
-        here.poll(
-            confinement.limits.wall_s
-        )  # once it speaks it holds nothing of the parent's any more, such as the lock
+        # once it speaks it holds nothing of the parent's any more, such as the lock
+        here.poll(confinement.limits.wall_s)
         yield _Conversation(confinement, here, process).result
     finally:
         _end(process)
