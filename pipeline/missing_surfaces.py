@@ -45,6 +45,9 @@ MAKEABLE = frozenset(
 LEAST_TRIANGLES = 1000
 #: A knee at rest is turned no farther than this; made surfaces are those of the nearest such pose (deg).
 MOST_ROTATION_DEG = 12.0
+#: A tibia that lies farther to one side than this is not at rest, and surfaces are made with it under the femur (mm).
+#: Origins of frames are found within about 2 mm.
+MOST_LATERAL_MM = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +101,8 @@ def make_surfaces(request: Request, jobs: int) -> Made:
     names = [name for name in request.names if name in MAKEABLE]
     if not names:
         return NOTHING_MADE
-    bones, turned_deg = _bones(request)
+    coordinates, taken_to_rest = _at_rest(request.anatomy.scan_attitude)
+    bones = _bones(request, coordinates)
     try:
         found = _masks(request, bones, names)
         meshes = _meshes(found, request, jobs)
@@ -109,21 +113,40 @@ def make_surfaces(request: Request, jobs: int) -> Made:
             "Label them, or set contact.missing_surfaces to leave.",
         ) from error
     sides = {body: tuple(n for n in meshes if found.masks[n].body == body) for body in ("reference", "moving")}
-    return Made(meshes, sides["reference"], sides["moving"], _findings(meshes, found.spaces, turned_deg))
+    return Made(meshes, sides["reference"], sides["moving"], _findings(meshes, found.spaces, taken_to_rest))
 
 
-def _bones(request: Request) -> tuple[KneeBones, float]:
-    """Both bodies in their frames at the scan pose, its rotation taken to that of a knee at rest, and by how much."""
-    anatomy = request.anatomy
-    scan_from_reference, scan_from_moving = (
-        np.asarray(frame) for frame in (anatomy.scan_from_reference, anatomy.scan_from_moving)
+def _at_rest(scan_attitude: tuple[float, ...]) -> tuple[JointCoordinates, tuple[str, ...]]:
+    """The pose that surfaces are made for, and in words how the scan differs from it.
+
+    It is the scan's own, unless a knee does not lie so at rest: turned too far, or the tibia beside the femur. There
+    the bones are nearest at a wall of the eminence, and what is made around them holds nothing.
+    """
+    flexion, varus, rotation, lateral, *shift = scan_attitude
+    turned = float(np.clip(rotation, -MOST_ROTATION_DEG, MOST_ROTATION_DEG))
+    centred = lateral if abs(lateral) <= MOST_LATERAL_MM else 0.0
+    words = []
+    if turned != rotation:
+        way = "in" if rotation > 0 else "out"
+        words.append(f"turned {abs(rotation):.0f} deg {way}wardly (at rest at most {MOST_ROTATION_DEG:.0f} deg)")
+    if centred != lateral:
+        way = "lateral" if lateral > 0 else "medial"
+        words.append(f"{abs(lateral):.1f} mm too far to {way} (at rest within {MOST_LATERAL_MM:.0f} mm)")
+    angles = (float(np.radians(angle)) for angle in (flexion, varus, turned))
+    return JointCoordinates(*angles, centred, *shift), tuple(words)
+
+
+def _bones(request: Request, coordinates: JointCoordinates) -> KneeBones:
+    """Both bodies in their frames, and the pose that surfaces are made for."""
+    reference, moving = (
+        in_frame(body, np.asarray(frame))
+        for body, frame in (
+            (request.reference, request.anatomy.scan_from_reference),
+            (request.moving, request.anatomy.scan_from_moving),
+        )
     )
-    flexion, varus, rotation, *shift = anatomy.scan_attitude
-    wanted = float(np.clip(rotation, -MOST_ROTATION_DEG, MOST_ROTATION_DEG))
-    coordinates = JointCoordinates(*(float(np.radians(angle)) for angle in (flexion, varus, wanted)), *shift)
     moving_from_reference: Float = np.linalg.inv(reference_from_moving(coordinates)).astype(np.float64)
-    reference, moving = in_frame(request.reference, scan_from_reference), in_frame(request.moving, scan_from_moving)
-    return KneeBones(reference, moving, moving_from_reference), rotation - wanted
+    return KneeBones(reference, moving, moving_from_reference)
 
 
 def _masks(request: Request, bones: KneeBones, names: Collection[str]) -> MadeSurfaces:
@@ -156,23 +179,24 @@ def _area_mm2(mask: SurfaceMask) -> float:
     return float(sum(faces)) / 1.5
 
 
-def _findings(meshes: Collection[str], spaces: dict[str, JointSpace], turned_deg: float) -> Findings:
+def _findings(meshes: Collection[str], spaces: dict[str, JointSpace], taken_to_rest: tuple[str, ...]) -> Findings:
     words = ", ".join(name.replace("_", " ") for name in meshes)
     apart = " and ".join(f"{space.between_mm:.1f} mm apart {name}ly" for name, space in spaces.items())
+    pose = "At a pose of rest" if taken_to_rest else "At the scan pose"
     out = [
         Finding(
             "N-CON-02",
             Severity.NOTE,
-            f"Made from the bones, not seen in the scan: {words}. At the scan pose the bones are {apart}.",
+            f"Made from the bones, not seen in the scan: {words}. {pose} the bones are {apart}.",
         )
     ]
     if not all(space.from_scan for space in spaces.values()):
         message = f"The bones are {apart}, which is no joint space: made cartilage has the protocol's thickness."
         out.append(Finding("W-CON-02", Severity.REVIEW, message))
-    if turned_deg:
+    if taken_to_rest:
         message = (
-            f"The tibia lies {abs(turned_deg):.0f} deg farther {'in' if turned_deg > 0 else 'out'}wardly turned in the "
-            f"scan than a knee at rest; cartilage and menisci were made for {MOST_ROTATION_DEG:.0f} deg."
+            f"The scan does not show a knee at rest: the tibia lies {' and '.join(taken_to_rest)}. "
+            "Cartilage and menisci were made for the nearest pose of rest."
         )
         out.append(Finding("W-CON-03", Severity.REVIEW, message))
     return tuple(out)

@@ -282,14 +282,37 @@ def _reversed(labels: LabelVolume) -> NDArray[np.float64]:
     return matrix
 
 
-def test_a_tibia_far_turned_in_the_scan_is_told(bare_knee: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    ("rotation_deg", "lateral_mm", "told"),
+    [
+        (30.0, 0.0, "the tibia lies turned 30 deg inwardly (at rest at most 12 deg)"),
+        (-20.0, 0.0, "the tibia lies turned 20 deg outwardly"),
+        (0.0, 5.5, "the tibia lies 5.5 mm too far to lateral (at rest within 3 mm)"),
+        (15.0, -4.0, "turned 15 deg inwardly (at rest at most 12 deg) and 4.0 mm too far to medial"),
+    ],
+)
+def test_a_scan_of_no_knee_at_rest_is_told(
+    bare_knee: dict[str, Any], rotation_deg: float, lateral_mm: float, told: str
+) -> None:
     seen = bare_knee[ANATOMY.name]
-    flexion, varus, _, *shift = seen.scan_attitude
-    run = Run(STAGE, {**bare_knee, ANATOMY.name: replace(seen, scan_attitude=(flexion, varus, 30.0, *shift))})
+    flexion, varus, _, _, *shift = seen.scan_attitude
+    attitude = (flexion, varus, rotation_deg, lateral_mm, *shift)
+    run = Run(STAGE, {**bare_knee, ANATOMY.name: replace(seen, scan_attitude=attitude)})
     findings = run.go(KNEE.model_copy(update={"missing_surfaces": "make"}))
-    (told,) = [one for one in findings if one.code == "W-CON-03"]
-    assert told.severity is Severity.REVIEW
-    assert "18 deg farther inwardly turned" in told.message
+    (finding,) = [one for one in findings if one.code == "W-CON-03"]
+    assert finding.severity is Severity.REVIEW
+    assert told in finding.message
+
+
+def test_surfaces_of_a_knee_beside_its_place_are_those_of_one_in_it(bare_knee: dict[str, Any]) -> None:
+    seen, made = bare_knee[ANATOMY.name], []
+    flexion, varus, rotation, _, *shift = seen.scan_attitude
+    for lateral in (0.0, -6.0):
+        attitude = (flexion, varus, rotation, lateral, *shift)
+        run = Run(STAGE, {**bare_knee, ANATOMY.name: replace(seen, scan_attitude=attitude)})
+        run.go(KNEE.model_copy(update={"missing_surfaces": "make"}))
+        made.append(run[MOVING_BODY].points)
+    np.testing.assert_array_equal(made[0], made[1])
 
 
 def test_bones_that_are_no_knee_are_refused(bare_knee: dict[str, Any]) -> None:

@@ -167,9 +167,9 @@ def _knee_lost(knee: Knee, kind: Kind) -> Measurement:
     return row
 
 
-def _leg_lost(name: str, limit: float) -> Measurement:
+def _leg_lost(name: str) -> Measurement:
     def row() -> Row:
-        return Row(f"leg_{name}_lost", f"legs_ssm/{name}: without a pose, 0 to 100 deg", _lost(_leg(name)), "", limit)
+        return Row(f"leg_{name}_lost", f"legs_ssm/{name}: without a pose, 0 to 100 deg", _lost(_leg(name)), "", 0.0)
 
     return row
 
@@ -199,7 +199,7 @@ ROWS: tuple[Measurement, ...] = (
         _knee_lost("knee_jam", "bones"),
         *_differences("knee_jam", ("bones", "labelled"), (2.5, 7.0, 3.0, 18.0)),
         *(row for kind in KINDS_OF_CT for row in _of_a_scan("knee_mr_a", kind)),
-        *(_leg_lost(name, 1.0 if name == "p2sd1" else 0.0) for name in LEGS),
+        *(_leg_lost(name) for name in LEGS),
         *(_nothing_made(name) for name in ("knee_mr_a", "knee_jam", *LEGS)),
     )
     if KNEE_JAM.exists()
