@@ -21,9 +21,10 @@ RUN /opt/ct2lut/bin/pip install --no-cache-dir --no-deps --no-build-isolation . 
     && NUMBA_CPU_NAME=generic /opt/ct2lut/bin/ct2lut compile
 
 FROM ${BASE}
-# EGL with the software renderer: pictures without a display or a graphics card
+# EGL with the software renderer: pictures without a display or a graphics card; Pango and a font: report.pdf
 RUN apt-get update \
     && apt-get install -y --no-install-recommends python3 libegl1 libgl1-mesa-dri \
+       libpango-1.0-0 libpangoft2-1.0-0 libharfbuzz-subset0 fonts-dejavu-core \
     && rm -rf /var/lib/apt/lists/*
 COPY --from=build /opt/ct2lut /opt/ct2lut
 # Works for any user ID, without a home and on a read-only root: what libraries cache goes to /tmp

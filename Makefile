@@ -14,7 +14,8 @@ override RESULTS := $(value RESULTS)
 override PROTOCOL := $(value PROTOCOL)
 override JOBS := $(value JOBS)
 override SET := $(value SET)
-export ID CASES RESULTS PROTOCOL JOBS SET
+override FILE := $(value FILE)
+export ID CASES RESULTS PROTOCOL JOBS SET FILE
 MAKEOVERRIDES =
 
 # The interpreter that makes the virtual environment; everything else runs inside it.
@@ -34,8 +35,8 @@ LOOK = || [ $$? -eq 11 ]
 NEED_ID = if [ -z "$$ID" ]; then echo "Which case? Type: make $@ ID=P001" >&2; exit 20; fi
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo demo-real check patient plan status report verify test lint format faults fuzz test-browser test-exports bench \
-	validate docs lock clean
+.PHONY: help setup setup-dev demo demo-real check patient plan status overview report open verify review test lint format faults fuzz test-browser test-exports bench \
+	validate pictures docs lock clean
 
 help:  ## show this list
 	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | \
@@ -69,11 +70,20 @@ plan: setup  ## say which stages of a case would run, and why: make plan ID=P001
 status: setup  ## how far one case (ID=P001) or every case has got
 	@set --; if [ -n "$$ID" ]; then set -- -- "$$ID"; fi; $(BIN)/ct2lut status --results "$$RESULTS" "$$@"
 
+overview: setup  ## one page of all cases, brought up to date: make overview [RESULTS=results]
+	@$(BIN)/ct2lut overview --results "$$RESULTS"
+
 report: setup  ## bring the report of a case up to date and say where it is: make report ID=P001
 	@$(NEED_ID); $(OPTIONS); $(BIN)/ct2lut report "$$@" --jobs "$$JOBS" -- "$$ID"
 
+open: setup  ## show the report of a case in a browser, or say where it is: make open ID=P001
+	@$(NEED_ID); $(BIN)/ct2lut open --results "$$RESULTS" -- "$$ID"
+
 verify: setup  ## compare the results of a case with their recorded checksums: make verify ID=P001
 	@$(NEED_ID); $(BIN)/ct2lut verify --results "$$RESULTS" -- "$$ID"
+
+review: setup  ## keep the decision that the report page saved: make review ID=P001 FILE=P001_review.json
+	@$(NEED_ID); $(BIN)/ct2lut review --results "$$RESULTS" -- "$$ID" "$$FILE"
 
 test: setup-dev  ## run the tests
 	@$(BIN)/python -P -m pytest
@@ -93,11 +103,14 @@ faults: setup-dev  ## run the tests of what may be wrong with a case (docs/fault
 fuzz: setup-dev  ## mutate scanner files more than a hundred times as often as the tests do; nothing may break out
 	@HOSTILE_MUTATIONS=1000 $(BIN)/python -P -m pytest tests/end_to_end/test_hostile_files.py -k "flipped or spoilt"
 
-test-browser: setup-dev  ## look at the viewer of the report in Chromium (skips without one)
-	@$(BIN)/python -P -m pytest tests/players/test_browser.py
+test-browser: setup-dev  ## try every page in Chromium (skips without one)
+	@$(BIN)/python -P -m pytest tests/players -rs
 
 test-exports: setup-dev  ## put the exports before the validators of their worlds (needs npm; OpenSim's wheel is 200 MB)
 	@npm install --silent --prefix build/validators gltf-validator
+	@command -v dciodvfy >/dev/null || { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get -qq update && \
+		DEBIAN_FRONTEND=noninteractive apt-get install -qq --no-install-recommends dicom3tools >/dev/null; } || \
+		echo "dciodvfy is missing, DICOM objects are not validated; type: sudo apt-get install dicom3tools" >&2
 	@[ -x build/validators/osim/bin/python ] || $(PYTHON) -m venv build/validators/osim
 	@build/validators/osim/bin/pip install --quiet opensim
 	@CT2LUT_NODE_MODULES=build/validators/node_modules CT2LUT_OPENSIM_PYTHON=build/validators/osim/bin/python \
@@ -108,6 +121,9 @@ bench: setup-dev  ## measure speed
 
 validate: setup-dev  ## compare with closed forms, the paper's test objects and published data
 	@$(BIN)/python -m tests.validate
+
+pictures: setup-dev  ## draw the pictures of the guides (docs/images) from phantom knees; those of pages need Chromium
+	@$(BIN)/python -m tools.pictures build/pictures docs/images
 
 docs: setup-dev  ## write the reference pages in docs/ and the flow in pipeline/README.md from the code
 	@$(BIN)/python -m tools.reference docs

@@ -59,7 +59,7 @@ SMOOTH_TABLE = array_artifact("smooth_table", "smooth_table.npz", SmoothTable)
 
 # 80_qa
 VERDICT = record_artifact("verdict", "verdict.json", Verdict)
-REPORT = folder("report", "report/")  # report.html and images/*.png
+REPORT = folder("report", "report/")  # report.html, report.pdf and images/*.png
 
 # 90_package
 PACKAGE = folder("package", "./")  # the deliverable itself: lut.h5, lut.csv, meshes/ ...

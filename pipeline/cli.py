@@ -20,8 +20,8 @@ from pipeline.case_id import check_case_id, is_case_id
 from pipeline.errors import ConfigError, ExitCode, PipelineError
 
 if TYPE_CHECKING:
+    from pipeline.commands.request import Request
     from pipeline.engine.stage import Stage
-    from pipeline.request import Request
 
 EXIT_CODES = """Exit codes: 0 PASS, 10 REJECTED (the case cannot be used), 11 REVIEW (look before you use it),
 20 wrong settings or usage, 30 the machine (disk, permission, renderer), 70 an error in the program, 130 interrupted."""
@@ -118,8 +118,8 @@ def plan(
 
     Example: ct2lut plan P001 --set smooth.flexion_degree=8
     """
+    from pipeline.commands.summary import plan_lines
     from pipeline.engine.runner import plan_case
-    from pipeline.summary import plan_lines
 
     request = _request(case_id, cases, results, protocol, overrides)
     flow = _flow()
@@ -141,8 +141,8 @@ def check(
 
     Example: ct2lut check P001
     """
-    from pipeline.preflight import closing, exit_code, lines
-    from pipeline.quick_look import examine
+    from pipeline.commands.preflight import closing, exit_code, lines
+    from pipeline.commands.quick_look import examine
 
     request = _request(case_id, cases, results, protocol, overrides)
     rows = examine(request, request.settings(_flow()))
@@ -161,17 +161,38 @@ def status(
 
     Example: ct2lut status P001
     """
+    from pipeline.commands.review import ReviewedCase, review_line
+    from pipeline.commands.summary import overview_line, status_lines
     from pipeline.engine.runner import read_status
-    from pipeline.summary import overview_line, status_lines
 
     flow = _flow()
     if case_id is not None:
-        _say(*status_lines(read_status(results / check_case_id(case_id), flow)))
+        folder = results / check_case_id(case_id)
+        _say(*status_lines(read_status(folder, flow), review_line(ReviewedCase(case_id, folder, flow[-1]))))
         return
     folders = sorted(path for path in results.iterdir() if path.is_dir()) if results.is_dir() else []
     _say(*(overview_line(path.name, read_status(path, flow)) for path in folders if is_case_id(path.name)))
     if not folders:
         _say(f"no results in {results}")
+
+
+@app.command()
+def overview(
+    results: Results = DEFAULT_RESULTS,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="The page to write; index.html in the results by default.")
+    ] = None,
+) -> None:
+    """Write one page of all cases: pictures, verdict, numbers, what is unusual.
+
+    Only what changed since the last time is read again.
+
+    Example: ct2lut overview --results results
+    """
+    from pipeline.commands.cohort_index import Places, overview_lines, write_overview
+
+    page = out or results / "index.html"
+    _say(*overview_lines(write_overview(Places(results, page), _flow()), page))
 
 
 @app.command()
@@ -207,63 +228,73 @@ def verify(case_id: CaseId, results: Results = DEFAULT_RESULTS) -> int:
     return ExitCode.ENVIRONMENT if problems else ExitCode.PASS
 
 
+@app.command(name="open")
+def open_page(case_id: CaseId, results: Results = DEFAULT_RESULTS) -> None:
+    """Open the report of a case.
+
+    Says where it is, and shows it in a browser if this machine has one.
+
+    Example: ct2lut open P001
+    """
+    from pipeline.commands.open_report import open_in_browser
+    from pipeline.commands.run_report import report_page
+
+    page = report_page(results / check_case_id(case_id), _flow())
+    if page is None:
+        raise ConfigError("E-OPN-01", f"{case_id} has no report yet.", f"Make it first: ct2lut report {case_id}.")
+    _say(f"report: {page}")
+    if not open_in_browser(page):
+        _say("No browser here. The page needs nothing else: copy it to a computer that has one and open it there.")
+
+
 @app.command()
-def lookup(
-    case_id: CaseId,
-    flexion: Annotated[float, typer.Option("--flexion", help="Flexion in degrees.")],
+def query(
+    table: Annotated[str, typer.Argument(metavar="ID", help="A finished case, or the path of a lut.h5.")],
+    flexion: Annotated[str, typer.Option("--flexion", help="Degrees; several, separated by commas, give CSV.")],
     varus: Annotated[float, typer.Option("--varus", help="Varus in degrees; negative is valgus.")] = 0.0,
-    results: Results = DEFAULT_RESULTS,
+    frame: Annotated[
+        Literal["jcs", "scan", "femur"] | None,
+        typer.Option("--frame", help="Only the six coordinates, or only one of the matrices."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for a program.")] = False,
     clamp: Annotated[bool, typer.Option("--clamp", help="Outside the table, take its nearest pose.")] = False,
+    results: Results = DEFAULT_RESULTS,
 ) -> None:
     """Print the stable pose at a flexion and varus.
 
-    Six coordinates, and the 4x4 matrix that moves the moving bone from where it was scanned (LPS, mm).
+    jcs: six coordinates (Grood & Suntay). scan: 4x4 that moves the moving bone from where it was scanned (LPS, mm).
+    femur: 4x4 from the tibia's frame to the femur's (mm).
 
-    Example: ct2lut lookup P001 --flexion 45 --varus 2
+    Example: ct2lut query P001 --flexion 60 --varus 2 --frame jcs
     """
-    from pipeline.playback import Lut
-    from pipeline.summary import pose_lines
+    from pipeline.commands.query import Question, answer, json_line, lines
+    from pipeline.commands.two_tables import open_table
 
-    path = results / check_case_id(case_id) / "90_package" / "lut.h5"
-    if not path.is_file():
-        problem = f"{case_id} has no finished table yet."
-        raise ConfigError("E-LUT-01", problem, f"Run it first: ct2lut run {case_id}.")
-    try:
-        table = Lut.open(path)
-        outside: Literal["clamp", "raise"] = "clamp" if clamp else "raise"
-        pose, motion = table.coordinates(flexion, varus, outside), table.pose(flexion, varus, outside)
-    except ValueError as error:
-        raise ConfigError("E-LUT-02", f"{error}.", "Ask for another attitude, or add --clamp.") from error
-    _say(*pose_lines(pose._asdict(), motion.tolist()))
+    found = answer(open_table(table, results), Question(flexion, varus, frame, clamp))
+    _say(*([json_line(found)] if as_json else lines(found)))
 
 
 @app.command()
 def export(
     case_id: CaseId,
+    cases: Cases = DEFAULT_CASES,
     results: Results = DEFAULT_RESULTS,
-    formats: Annotated[str, typer.Option("--format", help="Formats, separated by commas; all by default.")] = "",
+    formats: Annotated[
+        str, typer.Option("--format", help="Formats, separated by commas; all but dicom by default.")
+    ] = "",
     out: Annotated[Path, typer.Option("--out", help="Folder for the files.")] = Path("export"),
 ) -> None:
-    """Write the table of a finished case for other programs.
+    """Write a finished case for other programs.
 
-    glb (AR/VR), json, osim (OpenSim), slicer (3D Slicer); every package holds them too.
+    glb (AR/VR), json, osim (OpenSim), slicer (3D Slicer): every package holds them too. dicom (the archive): the report
+    and its pictures in the study of the CT; these files name the patient.
 
-    Example: ct2lut export P001 --format glb,json --out P001_vr
+    Example: ct2lut export P001 --format dicom --cases cases --out P001_archive
     """
-    from pipeline.exports import export_files, source_of
+    from pipeline.commands.export_case import ExportRequest, export_case
 
-    folder = results / check_case_id(case_id) / "90_package"
-    if not (folder / "manifest.json").is_file():
-        raise ConfigError("E-EXP-01", f"{case_id} has no finished package yet.", f"Run it first: ct2lut run {case_id}.")
-    package = {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    try:
-        files = export_files(source_of(package), [name for name in formats.split(",") if name] or None)
-    except ValueError as error:
-        raise ConfigError("E-EXP-02", f"{error}.", "Name other formats, or run the case again.") from error
-    for name, data in files.items():
-        (out / name).parent.mkdir(parents=True, exist_ok=True)
-        (out / name).write_bytes(data)
-    _say(*(f"{out / name}  {len(data) / 1e6:.2f} MB" for name, data in files.items()))
+    wanted = tuple(name for name in formats.split(",") if name)
+    _say(*export_case(ExportRequest(case_id, cases, results, wanted, out)))
 
 
 @app.command()
@@ -279,12 +310,31 @@ def compare(
 
     Example: ct2lut compare P001 P002 --out comparison.html
     """
+    from pipeline.commands.export_case import write_files
+    from pipeline.commands.two_tables import compare_cases, comparison_lines
     from pipeline.report.comparison_page import comparison_html
-    from pipeline.two_tables import compare_cases, comparison_lines
 
     page = compare_cases(first, second, results)
-    out.write_bytes(comparison_html(page))
+    write_files(out.parent, {out.name: comparison_html(page)})
     _say(*comparison_lines(page), f"page: {out}")
+
+
+@app.command()
+def review(
+    case_id: CaseId,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="What the last part of the report saved.")],
+    results: Results = DEFAULT_RESULTS,
+) -> None:
+    """Keep a reader's decision beside the result that it is of.
+
+    A review of another case or of an older result is refused; an earlier review is replaced.
+
+    Example: ct2lut review P001 P001_review.json
+    """
+    from pipeline.commands.review import ReviewedCase, store_review
+
+    kept = store_review(ReviewedCase(check_case_id(case_id), results / case_id, _flow()[-1]), file)
+    _say(f"{case_id}: {kept.sentence}")
 
 
 @app.command()
@@ -304,8 +354,8 @@ def phantom(
 
     Example: ct2lut phantom cases --id demo --set side=left --set spacing_mm=[1,1,1]
     """
+    from pipeline.commands.request import phantom_spec
     from pipeline.files.phantom_case import write_phantom_case
-    from pipeline.request import phantom_spec
 
     place = folder / check_case_id(case_id)
     write_phantom_case(place, phantom_spec(numbers or ()), as_ct=ct)
@@ -323,7 +373,7 @@ def compile_solver() -> int:
 
 
 def _request(case_id: str, cases: Path, results: Path, protocol: str, overrides: Sequence[str] | None) -> Request:
-    from pipeline.request import Request
+    from pipeline.commands.request import Request
 
     return Request(case_id, cases, results, protocol, tuple(overrides or ()))
 
@@ -337,9 +387,10 @@ def _flow() -> tuple[Stage, ...]:
 
 def _run(request: Request, jobs: int, flow: Sequence[Stage]) -> int:
     from pipeline.adapters.workers import get_ready
+    from pipeline.commands.run_report import write_run_page
+    from pipeline.commands.summary import closing, header
     from pipeline.engine.console import console_listener
     from pipeline.engine.runner import Execution, run_case
-    from pipeline.summary import closing, header, report_page
 
     settings = request.settings(_flow())
     _say(header(request.case_id, request.protocol, settings))
@@ -347,7 +398,7 @@ def _run(request: Request, jobs: int, flow: Sequence[Stage]) -> int:
     jobs = jobs or len(os.sched_getaffinity(0))
     execution = Execution(jobs, get_ready) if jobs > 1 else Execution(jobs)
     outcome = run_case(request.job(), flow, settings, execution, listener)
-    _say(*closing(outcome, report_page(request.job().results, flow)))
+    _say(*closing(outcome, write_run_page(outcome, request.job().results, flow)))
     return outcome.exit_code
 
 

@@ -8,11 +8,14 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.adapters.decimation import decimate_quadric
+from pipeline.case_id import check_case_id
+from pipeline.errors import ConfigError
 from pipeline.files.glb_file import GlbClip, GlbNode, GlbScene, encode_glb
 from pipeline.files.lut_content import LutFileContent
 from pipeline.files.lut_file import decode_lut
@@ -86,6 +89,20 @@ class ExportSource:
         named = (name for name in self.bodies if name in self.structures and self.bodies[name] == body)
         others = sorted(name for name in self.structures if name not in self.bodies)
         return tuple(others if body == "other" else named)
+
+
+def finished_package(results: Path, case_id: str) -> Path:
+    """The folder of a case's package.
+
+    Raises
+    ------
+    ConfigError
+        E-EXP-01 where there is none yet, E-ID-01 for an ID that is not plain.
+    """
+    folder = results / check_case_id(case_id) / "90_package"
+    if not (folder / "manifest.json").is_file():
+        raise ConfigError("E-EXP-01", f"{case_id} has no finished package yet.", f"Run it first: ct2lut run {case_id}.")
+    return folder
 
 
 def source_of(package: Mapping[str, bytes]) -> ExportSource:

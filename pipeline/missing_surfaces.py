@@ -122,7 +122,7 @@ def _at_rest(scan_attitude: tuple[float, ...]) -> tuple[JointCoordinates, tuple[
     It is the scan's own, unless a knee does not lie so at rest: turned too far, or the tibia beside the femur. There
     the bones are nearest at a wall of the eminence, and what is made around them holds nothing.
     """
-    flexion, varus, rotation, lateral, *shift = scan_attitude
+    flexion, varus, rotation, lateral, anterior, proximal = scan_attitude
     turned = float(np.clip(rotation, -MOST_ROTATION_DEG, MOST_ROTATION_DEG))
     centred = lateral if abs(lateral) <= MOST_LATERAL_MM else 0.0
     words = []
@@ -132,8 +132,8 @@ def _at_rest(scan_attitude: tuple[float, ...]) -> tuple[JointCoordinates, tuple[
     if centred != lateral:
         way = "lateral" if lateral > 0 else "medial"
         words.append(f"{abs(lateral):.1f} mm too far to {way} (at rest within {MOST_LATERAL_MM:.0f} mm)")
-    angles = (float(np.radians(angle)) for angle in (flexion, varus, turned))
-    return JointCoordinates(*angles, centred, *shift), tuple(words)
+    flexion_rad, varus_rad, turned_rad = (float(np.radians(angle)) for angle in (flexion, varus, turned))
+    return JointCoordinates(flexion_rad, varus_rad, turned_rad, centred, anterior, proximal), tuple(words)
 
 
 def _bones(request: Request, coordinates: JointCoordinates) -> KneeBones:

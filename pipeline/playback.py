@@ -146,6 +146,15 @@ class Lut:
                 return self._motion(flexion, varus, found)
         return motions(self._to_scan, *look_up(self._curves, flexion_deg, varus_deg, outside))
 
+    def reference_from_moving(
+        self, flexion_deg: ArrayLike, varus_deg: ArrayLike = 0.0, outside: Outside = "raise"
+    ) -> Float:
+        """(..., 4, 4) the moving body's frame in the reference body's, mm; parameters and errors of :meth:`pose`.
+
+        For column vectors of the kinematic frames, x lateral for both sides: ``femur_from_tibia`` of a knee.
+        """
+        return motions(motion_map(np.eye(4), np.eye(4)), *look_up(self._curves, flexion_deg, varus_deg, outside))
+
     def coordinates(
         self, flexion_deg: ArrayLike, varus_deg: ArrayLike = 0.0, outside: Outside = "raise"
     ) -> PoseCoordinates:

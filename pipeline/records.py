@@ -12,6 +12,7 @@ Side = Literal["right", "left"]
 Vector = tuple[float, float, float]
 Matrix = tuple[tuple[float, float, float, float], ...]
 Word = Literal["PASS", "REVIEW"]
+BaselineName = Literal["hinge", "walker"]
 
 
 @dataclass(frozen=True)
@@ -201,6 +202,16 @@ class JumpCount:
 
 
 @dataclass(frozen=True)
+class CheckedAttitude:
+    """One attitude that both solvers solved: how far apart their poses are, (x, y) and rotation."""
+
+    flexion_deg: float
+    varus_deg: float
+    shift_mm: float
+    rotation_deg: float
+
+
+@dataclass(frozen=True)
 class CrossCheck:
     """A sample of the cells solved by the other solver from the same start.
 
@@ -213,6 +224,8 @@ class CrossCheck:
         Largest differences.
     deeper_mm, shallower_mm : float
         How much deeper, and shallower, the table's pose is at most.
+    attitudes : tuple of CheckedAttitude
+        Those compared, one by one.
     """
 
     cells: int
@@ -223,6 +236,25 @@ class CrossCheck:
     rotation_deg: float
     deeper_mm: float
     shallower_mm: float
+    attitudes: tuple[CheckedAttitude, ...] = ()
+
+
+@dataclass(frozen=True)
+class BaselineCost:
+    """What a motion that ignores the surfaces costs on these bones, at the flexions where it is known.
+
+    Attributes
+    ----------
+    name : str
+        A plain hinge about the flexion axis, or the published average motion of Walker et al. (1988).
+    flexion_deg : tuple of float
+    way_mm : tuple of float
+        Signed way along delta to first contact: + a gap, - an overlap.
+    """
+
+    name: BaselineName
+    flexion_deg: tuple[float, ...]
+    way_mm: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -239,6 +271,8 @@ class SweepFacts:
     jumps_before, jumps_after : JumpCount
         As first found, and after jumps were solved again from both sides.
     cross_check : CrossCheck
+    baselines : tuple of BaselineCost
+        Empty where they were not asked for.
     """
 
     solver: Literal["direct", "incremental"]
@@ -247,6 +281,7 @@ class SweepFacts:
     jumps_before: JumpCount
     jumps_after: JumpCount
     cross_check: CrossCheck
+    baselines: tuple[BaselineCost, ...] = ()
 
 
 @dataclass(frozen=True)

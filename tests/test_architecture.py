@@ -37,6 +37,7 @@ WRAPPED = {
     "highdicom",
     "gdcm",
     "jpeg_ls",
+    "weasyprint",
 }
 #: What maths may not see: paths, settings, logs, processes, the wrapped libraries.
 IMPURE = WRAPPED | {
@@ -81,8 +82,10 @@ def test_compiled_libraries_are_imported_only_where_they_are_wrapped(module: Mod
 def test_folders_import_in_one_direction(module: Module) -> None:
     if module.package in MAY_IMPORT:
         assert set(pipeline_imports(module)) <= MAY_IMPORT[module.package]
-    if module.package in ("files", "adapters", "report", *PURE, "engine"):
-        assert "stages" not in set(pipeline_imports(module))
+    if module.package in ("files", "adapters", "report", "labels", *PURE, "engine"):
+        assert not {"stages", "commands"} & set(pipeline_imports(module))
+    if module.package == "stages":
+        assert "commands" not in set(pipeline_imports(module))
 
 
 @each_module

@@ -51,7 +51,7 @@ def test_a_run_from_header_to_verdict(ct2lut: Run) -> None:
     assert (code, err) == (ExitCode.PASS, "")
     assert lines[0] == "P001   right knee   protocol clinical"
     assert [line.split()[:3] for line in lines[1:3]] == [["[1/2]", "intake", "ok"], ["[2/2]", "qa", "ok"]]
-    assert lines[3:] == ["PASS   P001", "report: results/P001/80_qa/report/report.html"]
+    assert lines[3:] == ["PASS   P001", "report: results/P001/report.html"]
     assert Path("results/P001/80_qa/report/report.html").read_text() == "<p>labels fine</p>"
 
 
@@ -79,8 +79,10 @@ def test_a_rejected_case_says_what_to_do(ct2lut: Run) -> None:
         "REJECTED   P002   E-SIDE-01",
         "  The side is not given.",
         "  Add side: right or side: left to case.yaml.",
+        "report: results/P002/report.html",
     ]
     assert verdict == expected
+    assert "The side is not given." in Path("results/P002/report.html").read_text()
 
 
 def test_a_wrong_declaration_is_the_fault_of_the_case(ct2lut: Run) -> None:
@@ -108,7 +110,7 @@ def test_a_missing_case_is_rejected(ct2lut: Run) -> None:
         (["report", "../P001"], "E-ID-01"),
         (["verify", "../P001"], "E-ID-01"),
         (["status", "../P001"], "E-ID-01"),
-        (["lookup", "../P001", "--flexion", "0"], "E-ID-01"),
+        (["open", "../P001"], "E-ID-01"),
         (["phantom", "cases", "--id", "../P001"], "E-ID-01"),
         (["phantom", "cases", "--id", "P001"], "E-PHA-01"),
         (
@@ -118,7 +120,13 @@ def test_a_missing_case_is_rejected(ct2lut: Run) -> None:
         (["phantom", "cases", "--set", "scale=9"], "E-PHA-03"),
         (["phantom", "cases", "--set", "side=both"], "E-PHA-03"),
         (["run", "p001"], "E-ID-02"),
-        (["lookup", "P001", "--flexion", "0"], "E-LUT-01"),
+        (["open", "P001"], "E-OPN-01  P001 has no report yet."),
+        (["query", "P001", "--flexion", "0"], "E-CMP-01  There is no finished table of"),
+        (["query", "../P001/lut.h5", "--flexion", "0"], "E-CMP-01"),
+        (["query", "P001"], "E-USE-01"),
+        (["query", "P001", "--flexion", "0", "--frame", "tibia"], "E-USE-01"),
+        (["overview"], "E-OVW-01"),
+        (["overview", "--results", "cases", "--out", "list.txt"], "E-OVW-02"),
         (["run"], "E-USE-01"),
         (["run", "P001", "--job", "1"], "E-USE-01"),
         (["run", "P001", "--jobs", "-1"], "E-USE-01"),
@@ -212,6 +220,20 @@ def test_status_of_one_and_of_all(ct2lut: Run) -> None:
     assert every.split()[:3] == ["P001", "2/2", "stages"]
 
 
+def test_the_overview_is_a_page_of_all_cases(ct2lut: Run) -> None:
+    write_case(Path("cases/P002"), "{}")
+    ct2lut("run", "P001", "--set", "qa.review=true")
+    ct2lut("run", "P002")
+    expected = "2 cases, 2 read again\npage: results/index.html\n"
+    assert ct2lut("overview") == (ExitCode.PASS, expected, "")
+    text = Path("results/index.html").read_text()
+    assert 'href="./P001/report.html"' in text
+    assert "Look at the toy." in text
+    assert "E-SIDE-01  The side is not given." in text
+    assert ct2lut("overview", "--out", "list.html")[1].endswith("page: list.html\n")
+    assert len(ct2lut("status")[1].splitlines()) == 2
+
+
 def test_verify_finds_a_changed_file(ct2lut: Run) -> None:
     ct2lut("run", "P001")
     assert ct2lut("verify", "P001")[0] == ExitCode.PASS
@@ -226,7 +248,7 @@ def test_verify_finds_a_changed_file(ct2lut: Run) -> None:
 def test_report_shows_the_page(ct2lut: Run) -> None:
     code, out, _ = ct2lut("report", "P001")
     assert code == ExitCode.PASS
-    assert out.splitlines()[-1] == "report: results/P001/80_qa/report/report.html"
+    assert out.splitlines()[-1] == "report: results/P001/report.html"
 
 
 def test_a_bug_is_one_line(ct2lut: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -261,7 +283,7 @@ def test_version_and_help(ct2lut: Run) -> None:
     assert code == 0
     assert "Research" in out
     assert all(
-        command in out for command in ("run", "check", "plan", "status", "verify", "report", "lookup", "phantom")
+        command in out for command in ("run", "check", "plan", "status", "verify", "report", "query", "open", "phantom")
     )
 
 
@@ -300,6 +322,7 @@ HEAVY = (
     "SimpleITK",
     "meshio",
     "jinja2",
+    "weasyprint",
 )
 
 

@@ -17,7 +17,7 @@ from pipeline.config import joints, load_settings, merge, protocols
 from pipeline.engine.stage import StrictParams
 from pipeline.errors import CaseRejected, ConfigError
 from pipeline.flow import FLOW
-from pipeline.label_scheme import without_side
+from pipeline.labels.scheme import without_side
 from tests.toy_flow import TOY_FLOW, IntakeParams, QaParams, write_toy_configs
 
 JOINTS, PROTOCOLS, PRESETS = joints(), protocols(), case_declaration.label_presets()

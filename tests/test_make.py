@@ -35,7 +35,7 @@ HOSTILE = (
     "*",
 )
 
-TARGETS = ("help", "setup", "demo", "demo-real", "check", "patient", "plan", "status", "report", "verify")
+TARGETS = ("help", "setup", "demo", "demo-real", "check", "patient", "plan", "status", "report", "verify", "review")
 DEVELOPER_TARGETS = ("test", "lint", "bench", "validate", "clean")
 VARIABLES = ("ID", "CASES", "RESULTS", "PROTOCOL", "SET", "JOBS")
 
@@ -81,7 +81,7 @@ def test_nothing_typed_is_run(checkout: Path, variable: str, way: str) -> None:
 
 
 @pytest.mark.parametrize("way", ["command line", "environment"])
-@pytest.mark.parametrize("target", ["check", "patient", "plan", "report", "verify", "status"])
+@pytest.mark.parametrize("target", ["check", "patient", "plan", "report", "open", "verify", "status"])
 @pytest.mark.parametrize("hostile", HOSTILE)
 def test_id_arrives_letter_by_letter(checkout: Path, hostile: str, target: str, way: str) -> None:
     words, environment = ((f"ID={hostile}",), None) if way == "command line" else ((), {"ID": hostile})
@@ -110,6 +110,13 @@ def test_settings_become_options(checkout: Path) -> None:
     assert arguments(checkout) == expected
 
 
+@pytest.mark.parametrize("hostile", HOSTILE)
+def test_a_file_arrives_letter_by_letter(checkout: Path, hostile: str) -> None:
+    make(checkout, "review", "ID=P001", f"FILE={hostile}")
+    assert "\n".join(arguments(checkout)) == f"review\n--results\nresults\n--\nP001\n{hostile}"
+    assert not (checkout / "SENTINEL").exists()
+
+
 @pytest.mark.parametrize("target", ["check", "plan"])
 def test_looking_takes_settings_and_no_number_of_jobs(checkout: Path, target: str) -> None:
     make(checkout, target, "ID=P001", "SET=sweep.step_deg=2", "JOBS=3")
@@ -117,11 +124,18 @@ def test_looking_takes_settings_and_no_number_of_jobs(checkout: Path, target: st
     assert arguments(checkout) == [*expected, "--protocol", "clinical", "--", "P001"]
 
 
-@pytest.mark.parametrize("target", ["check", "patient", "plan", "report", "verify"])
+@pytest.mark.parametrize("target", ["check", "patient", "plan", "report", "open", "verify"])
 def test_missing_id_is_explained(checkout: Path, target: str) -> None:
     answer = make(checkout, target)
     assert answer.returncode == 2
     assert f"Type: make {target} ID=P001" in answer.stderr
+
+
+@pytest.mark.parametrize("hostile", HOSTILE)
+def test_a_folder_arrives_letter_by_letter(checkout: Path, hostile: str) -> None:
+    make(checkout, "overview", f"RESULTS={hostile}")
+    assert "\n".join(arguments(checkout)) == f"overview\n--results\n{hostile}"
+    assert not (checkout / "SENTINEL").exists()
 
 
 def test_status_needs_no_id(checkout: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from pipeline.files.lut_file import encode_lut
 from pipeline.kinematics.interpolation import moved_from_scan_table
+from pipeline.kinematics.joint_coordinates import rotation_x, rotation_y
 from pipeline.playback import Lut
 from tests.files.lut_sample import GRID, content
 
@@ -68,6 +69,19 @@ def test_coordinates_have_clinical_units_and_say_what_was_used(tmp_path: Path) -
     beyond = lut.coordinates([25.0, 99.0], 2.5, outside="clamp")
     np.testing.assert_array_equal(beyond.flexion_deg, [25.0, 60.0])
     assert beyond.internal_rotation_deg[1] == poses.internal_rotation_deg[-1, 3]
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_the_frames_of_both_bodies_give_the_same_pose(tmp_path: Path, side: str) -> None:
+    lut, made = written(tmp_path, side), content(side)
+    flexion = np.linspace(0.0, 60.0, 7)
+    frames = lut.reference_from_moving(flexion, -0.5)
+    chained = made.scan_from_reference @ frames @ np.linalg.inv(made.scan_from_moving)
+    np.testing.assert_allclose(lut.pose(flexion, -0.5), chained, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(frames[:, :3, :3]), 1.0, rtol=0, atol=1e-12)
+    expected = lut.coordinates(60.0, -0.5)
+    attitude = frames[-1, :3, 3] @ (rotation_x(-np.radians(60.0)) @ rotation_y(np.radians(-0.5)))
+    np.testing.assert_allclose(attitude, expected[3:], rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,10 @@ missing_packages() {
     "$python" -c 'import ensurepip, venv' 2>/dev/null || echo python3-venv
     any_file /usr/lib/*/libEGL.so.1 /usr/lib64/libEGL.so.1 || echo libegl1
     any_file /usr/lib/*/dri/swrast_dri.so /usr/lib64/dri/swrast_dri.so || echo libgl1-mesa-dri
+    any_file /usr/lib/*/libpango-1.0.so.0 /usr/lib64/libpango-1.0.so.0 || echo libpango-1.0-0
+    any_file /usr/lib/*/libpangoft2-1.0.so.0 /usr/lib64/libpangoft2-1.0.so.0 || echo libpangoft2-1.0-0
+    any_file /usr/lib/*/libharfbuzz-subset.so.0 /usr/lib64/libharfbuzz-subset.so.0 || echo libharfbuzz-subset0
+    any_file /usr/share/fonts/*/*/DejaVuSans.ttf /usr/share/fonts/*/DejaVuSans.ttf || echo fonts-dejavu-core
 }
 
 install_packages() {

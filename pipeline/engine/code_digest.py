@@ -34,6 +34,7 @@ NUMERIC_PACKAGES = (
     "meshio",
     "h5py",
     "matplotlib",
+    "weasyprint",
     "nibabel",
     "pynrrd",
 )

@@ -56,10 +56,14 @@ class ConfinedBug(Exception):
 
 @dataclass(frozen=True)
 class Made:
-    """What a stage made: its findings, and artifact name -> encoded files."""
+    """What a stage made: its findings, artifact name -> encoded files, and how long its parts took (seconds).
+
+    Parts of a confined stage stay in its process.
+    """
 
     findings: Findings
     held: Mapping[str, Files]
+    parts: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

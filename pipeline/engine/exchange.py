@@ -108,6 +108,7 @@ class StageOutputs:
     jobs: int
     report: Callable[[int, int], None]
     held: dict[str, Files] = field(default_factory=dict)
+    parts: dict[str, float] = field(default_factory=dict)
 
     def __setitem__(self, artifact: Artifact[T], value: T) -> None:
         """Encode a declared artifact.
@@ -124,6 +125,10 @@ class StageOutputs:
     def progress(self, done: int, total: int) -> None:
         """Tell the user how far the stage is."""
         self.report(done, total)
+
+    def took(self, part: str, seconds: float) -> None:
+        """Note how long a part of the stage took; the same part again adds to it."""
+        self.parts[part] = round(self.parts.get(part, 0.0) + seconds, 3)
 
     def complete(self) -> Mapping[str, Files]:
         """Everything the stage wrote.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -85,6 +85,8 @@ class Manifest:
     findings : tuple of Finding
     seconds : float
         Wall time of the stage.
+    parts : dict of str to float
+        What of it the stage told by itself, in words -> seconds.
     sources : dict of str to str
         Module or resource -> SHA-256 of its bytes; decides nothing, saves parsing them again.
     """
@@ -95,6 +97,7 @@ class Manifest:
     findings: Findings
     seconds: float
     sources: dict[str, str]
+    parts: dict[str, float] = field(default_factory=dict)
 
     def files_of(self, artifact: Artifact[Any]) -> dict[str, str]:
         """File name inside the stage's folder -> name relative to the artifact, in sorted order."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -55,6 +55,10 @@ class StageOutcome:
         Wall time in this run.
     findings : tuple of Finding
         Also of a stage whose result was taken from disk.
+    computing_s : float
+        Seconds its result took to compute, in this run or an earlier one.
+    parts : dict of str to float
+        What of that the stage told by itself, in words -> seconds.
     """
 
     stage: str
@@ -63,6 +67,8 @@ class StageOutcome:
     reason: str
     seconds: float
     findings: Findings
+    computing_s: float = 0.0
+    parts: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 from pipeline.engine.cache import Lookup, look_up
@@ -91,10 +91,13 @@ class _Run:
         self.log.write(LogLine("info", f"runs, because: {reason}", stage.name))
         self.listener.stage_started(stage.name, len(self.outcomes) + 1, len(self.flow), reason)
 
-    def end(self, state: State, reason: str, findings: Findings = ()) -> None:
+    def end(self, state: State, reason: str, manifest: Manifest | None = None) -> None:
         if self.current is None:
             return
-        outcome = StageOutcome(self.current.name, self.current.number, state, reason, self.seconds, findings)
+        stage, seconds = self.current, self.seconds
+        outcome = StageOutcome(stage.name, stage.number, state, reason, seconds, ())
+        if manifest:
+            outcome = replace(outcome, findings=manifest.findings, computing_s=manifest.seconds, parts=manifest.parts)
         self.current = None
         self.outcomes.append(outcome)
         level: Level = "error" if state == "failed" else "info"
@@ -188,7 +191,7 @@ def _bring_up_to_date(run: _Run) -> None:
         found = look_up(run.job.results / stage.folder, stage, run.settings[stage.name], shelf.records)
         manifest = found.manifest or _computed(run, stage, shelf, found)
         shelf.add(stage, manifest)
-        run.end("cached" if found.manifest else "ran", found.reason, manifest.findings)
+        run.end("cached" if found.manifest else "ran", found.reason, manifest)
 
 
 def _computed(run: _Run, stage: Stage, shelf: Shelf, found: Lookup) -> Manifest:
@@ -205,7 +208,7 @@ def _computed(run: _Run, stage: Stage, shelf: Shelf, found: Lookup) -> Manifest:
     own = {listed.name: listed.encode(made.findings), used.name: used.encode(settings.model_dump(mode="json"))}
     files = stage_files(stage, {**made.held, **own})
     recipe, outputs = found.recipe, _output_records(files)
-    manifest = Manifest(recipe.key, recipe, outputs, made.findings, run.seconds, found.sources)
+    manifest = Manifest(recipe.key, recipe, outputs, made.findings, run.seconds, found.sources, dict(made.parts))
     data = {name: content for name, (_, content) in files.items()}
     commit_folder(folder, {**data, MANIFEST_FILE: encode_manifest(manifest)})
     _log_findings(run.log, stage, made.findings)
@@ -234,7 +237,7 @@ def _begun(run: _Run, stage: Stage, shelf: Shelf) -> Iterator[Callable[[], Made]
 def _made(run: _Run, reads: StageInputs, progress: Callable[[int, int], None]) -> Made:
     out = StageOutputs(reads.stage, run.execution.jobs, progress)
     findings = reads.stage.run(reads, run.settings[reads.stage.name], out)
-    return Made(findings, out.complete())
+    return Made(findings, out.complete(), out.parts)
 
 
 def _output_records(files: Mapping[str, tuple[str, bytes]]) -> dict[str, OutputRecord]:

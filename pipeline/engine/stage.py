@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Protocol, TypeVar
@@ -73,6 +75,18 @@ class Outputs(Protocol):
     def progress(self, done: int, total: int) -> None:
         """Tell the user how far the stage is."""
         ...
+
+    def took(self, part: str, seconds: float) -> None:
+        """Note how long a part of the stage took, in words for people; parts may have run side by side."""
+        ...
+
+
+@contextmanager
+def timed(out: Outputs, part: str) -> Iterator[None]:
+    """Note how long what is done inside took."""
+    since = time.perf_counter()
+    yield
+    out.took(part, time.perf_counter() - since)
 
 
 @dataclass(frozen=True)

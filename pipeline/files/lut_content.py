@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.mesh import TriangleMesh
-from pipeline.kinematics.interpolation import found_coordinates, usable_entries
+from pipeline.kinematics.interpolation import FOUND
 from pipeline.kinematics.neutral import NeutralCurve
 from pipeline.kinematics.table import Grid, LutTable, PoseTable, RawTable, SmoothTable, Status
 
@@ -69,13 +69,14 @@ def check_content(content: LutFileContent) -> None:
     Raises
     ------
     ValueError
-        When the grid does not increase, an array does not fit it, a usable entry is not finite or an unusable one
-        is, a frame is not a rigid frame of the declared side, delta is not the moving frame's z axis, or a body is
-        not a triangle mesh.
+        When the grid does not increase, an array or the neutral curve does not fit it, a usable entry is not finite
+        or an unusable one is, a frame is not a rigid frame of the declared side, delta is not the moving frame's z
+        axis, or a body is not a triangle mesh.
     """
     _check_grid(content.smooth.grid, content.raw.grid)
     for name, poses in (("lut", content.smooth.poses), ("raw", content.raw.poses)):
         _check_poses(poses, content.smooth.grid, name)
+    _check_neutral(content.neutral, content.smooth.grid)
     _check_frames(content)
     for name, body in (("reference", content.reference_body), ("moving", content.moving_body)):
         _check_body(body, name)
@@ -91,13 +92,33 @@ def _check_grid(grid: Grid, other: Grid) -> None:
 
 
 def _check_poses(poses: PoseTable, grid: Grid, name: str) -> None:
-    for field in fields(poses):
-        if (shape := getattr(poses, field.name).shape) != grid.shape:
-            raise ValueError(f"{name} {field.name}: expected shape {grid.shape} of the grid, got {shape}")
-    if poses.status.max() > max(Status):
-        raise ValueError(f"{name} status: expected 0 to {max(Status):d}, got {poses.status.max()}")
-    if not np.isfinite(found_coordinates(poses)[usable_entries(poses)]).all():
+    _check_fields(poses, grid.shape, name)
+    _check_entries(np.stack([getattr(poses, found) for found in FOUND]), poses.status, name)
+
+
+def _check_neutral(neutral: NeutralCurve, grid: Grid) -> None:
+    _check_fields(neutral, grid.shape[:1], "neutral")
+    if not np.array_equal(neutral.flexion_deg, grid.flexion_deg):
+        raise ValueError("neutral flexion_deg: expected the flexion of the grid")
+    known = [getattr(neutral, field) for field in ("varus_deg", *FOUND, "uneven_mm")]
+    _check_entries(np.stack(known), neutral.status, "neutral")
+
+
+def _check_fields(arrays: PoseTable | NeutralCurve, expected: tuple[int, ...], name: str) -> None:
+    for field in fields(arrays):
+        if (shape := getattr(arrays, field.name).shape) != expected:
+            raise ValueError(f"{name} {field.name}: expected shape {expected} of the grid, got {shape}")
+
+
+def _check_entries(values: Float, status: NDArray[np.uint8], name: str) -> None:
+    """``values`` (K, ...) finite where the status (...) is usable, and NaN where it is not."""
+    if status.max() > max(Status):
+        raise ValueError(f"{name} status: expected 0 to {max(Status):d}, got {status.max()}")
+    usable = status <= Status.SMOOTHED
+    if not np.isfinite(values[:, usable]).all():
         raise ValueError(f"{name}: a usable entry has a coordinate that is not a finite number")
+    if not np.isnan(values[:, ~usable]).all():
+        raise ValueError(f"{name}: an entry that is not usable has a coordinate")
 
 
 def _check_frames(content: LutFileContent) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -21,17 +21,19 @@ from pipeline.files.lut_schema import (
     DATASETS,
     FILE_TEXTS,
     FIXED_SIZES,
-    FLAGS,
     FORMAT,
+    MINOR,
     SCALES,
     SMOOTHING_TEXTS,
     VERSION,
     DatasetSpec,
     arrays_of,
     content_of,
+    links,
     root_attributes,
     smoothing_attributes,
     text_checksum,
+    value_names,
 )
 
 Array = NDArray[Any]
@@ -39,9 +41,6 @@ Array = NDArray[Any]
 #: HDF5 1.10 structures: checksummed, and readable by every library since 2016.
 _FILE_VERSION = ("v110", "v110")
 _STORAGE = {"compression": "gzip", "compression_opts": 6, "shuffle": True, "fletcher32": True}
-
-#: Groups that hold a hard link to each grid axis, so that CF readers find the coordinates beside the data.
-_COORDINATES_IN = ("/", "/lut", "/raw", "/smoothing")
 
 #: The file and each of its arrays; a table of 100,000 entries with two bodies of 500,000 triangles stays well below.
 MAX_BYTES = 256 * 2**20
@@ -60,7 +59,7 @@ _CF_UNITS = {"deg": "degree", "mixed": "1"}
 
 
 def encode_lut(content: LutFileContent) -> bytes:
-    """Bytes of ``lut.h5``, version 1.
+    """Bytes of ``lut.h5``, version 1.1.
 
     Raises
     ------
@@ -74,15 +73,16 @@ def encode_lut(content: LutFileContent) -> bytes:
     arrays = arrays_of(content)
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", libver=_FILE_VERSION) as file:
-        for spec in DATASETS:
+        for spec in sorted(DATASETS, key=lambda spec: not spec.is_scale):
             _write_dataset(file, spec, arrays[spec.path])
-        _link_coordinates(file)
+        for place, target in links(MINOR).items():
+            file[place] = file[target]
         texts, fits = root_attributes(content), smoothing_attributes(content)
         _write_texts(file, texts)
         _write_texts(file["/smoothing"], fits)
         file.attrs[_SEAL] = np.uint32(text_checksum(texts | fits))
-        for name in ("/lut/status", "/raw/status"):
-            _write_flags(file[name])
+        for path, names in value_names(content).items():
+            _write_flags(file[path], names)
     return buffer.getvalue()
 
 
@@ -101,17 +101,11 @@ def _write_dataset(file: Any, spec: DatasetSpec, array: Array) -> None:
             "description": f"{spec.title}: {spec.meaning}",
         },
     )
+    if spec.is_scale:
+        dataset.make_scale(spec.dims[0])
+        return
     for axis, dim in enumerate(spec.dims):
-        if spec.path == SCALES.get(dim):
-            dataset.make_scale(dim)
-        elif dim in SCALES:
-            dataset.dims[axis].attach_scale(file[SCALES[dim]])
-
-
-def _link_coordinates(file: Any) -> None:
-    for group in _COORDINATES_IN:
-        for axis in ("flexion_deg", "varus_deg"):
-            file[group][axis] = file[SCALES[axis]]
+        dataset.dims[axis].attach_scale(file[SCALES[dim]])
 
 
 def _write_texts(target: Any, texts: Mapping[str, str]) -> None:
@@ -119,10 +113,12 @@ def _write_texts(target: Any, texts: Mapping[str, str]) -> None:
         target.attrs[name] = text
 
 
-def _write_flags(dataset: Any) -> None:
-    dataset.attrs["flags"] = list(FLAGS)
-    dataset.attrs["flag_values"] = np.arange(len(FLAGS), dtype=np.uint8)
-    dataset.attrs["flag_meanings"] = " ".join(FLAGS)
+def _write_flags(dataset: Any, names: tuple[str, ...]) -> None:
+    """Names of the values, for people and for CF readers; nothing for a table without fits."""
+    if names:
+        dataset.attrs["flags"] = list(names)
+        dataset.attrs["flag_values"] = np.arange(len(names), dtype=dataset.dtype)
+        dataset.attrs["flag_meanings"] = " ".join(names)
 
 
 def decode_lut(data: bytes) -> LutFileContent:
@@ -147,7 +143,7 @@ def decode_lut(data: bytes) -> LutFileContent:
         raise ValueError(f"not a readable table, or a damaged one: {error}") from error
     content = content_of(arrays, texts)
     check_content(content)
-    _check_formula(arrays, arrays_of(content))
+    _check_derived(arrays, arrays_of(content))
     return content
 
 
@@ -179,19 +175,25 @@ def _read_texts(file: Any) -> dict[str, str]:
 
 
 def _read_arrays(file: Any) -> dict[str, Array]:
-    _check_links(file, "/", _members())
+    minor = min(_minor(file), MINOR)
+    known = [spec for spec in DATASETS if spec.since <= minor]
+    _check_links(file, "/", _members([*(spec.path for spec in known), *links(minor)]))
     sizes = dict(FIXED_SIZES)
-    for spec in DATASETS:
+    for spec in known:
         _check_dataset(file[spec.path], spec, sizes)
     _check_intervals(sizes)
-    return {spec.path: file[spec.path][()] for spec in DATASETS}
+    return {spec.path: file[spec.path][()] for spec in known}
 
 
-def _members() -> dict[str, set[str]]:
-    """Names of the members of every group of version 1."""
-    members: dict[str, set[str]] = {group: {"flexion_deg", "varus_deg"} for group in _COORDINATES_IN}
-    for spec in DATASETS:
-        path = spec.path
+def _minor(file: Any) -> int:
+    return int(_text(file, "version").partition(".")[2])
+
+
+def _members(paths: Iterable[str]) -> dict[str, set[str]]:
+    """Names of the members of every group on the way to some paths."""
+    members: dict[str, set[str]] = {}
+    for full in paths:
+        path = full
         while path != "/":
             group, _, name = path.rpartition("/")
             members.setdefault(group or "/", set()).add(name)
@@ -204,7 +206,7 @@ def _check_links(group: Any, path: str, members: Mapping[str, set[str]]) -> None
     import h5py  # noqa: PLC0415 - see encode_lut
 
     # names of a later minor version are not opened, so they need not be known
-    if unknown := sorted(set(group) - members[path]) if _is_own_minor(group) else []:
+    if unknown := sorted(set(group) - members[path]) if _minor(group.file) <= MINOR else []:
         raise ValueError(f"{path}: unknown member {unknown[0]!r}")
     for name in sorted(members[path]):
         full = f"{path.rstrip('/')}/{name}"
@@ -215,10 +217,6 @@ def _check_links(group: Any, path: str, members: Mapping[str, set[str]]) -> None
             raise ValueError(f"{full}: expected a {'group' if is_group else 'dataset'}")
         if is_group:
             _check_links(member, full, members)
-
-
-def _is_own_minor(group: Any) -> bool:
-    return _text(group.file, "version") == VERSION
 
 
 def _check_dataset(dataset: Any, spec: DatasetSpec, sizes: dict[str, int]) -> None:
@@ -251,11 +249,15 @@ def _own_filters() -> set[int]:
 
 
 def _check_intervals(sizes: Mapping[str, int]) -> None:
-    if sizes["flexion_interval"] != sizes["flexion_deg"] - 1:
+    if sizes["flexion_midpoint_deg"] != sizes["flexion_deg"] - 1:
         raise ValueError(f"/smoothing/midpoint_error_mm: expected {sizes['flexion_deg'] - 1} flexion intervals")
 
 
-def _check_formula(stored: Mapping[str, Array], computed: Mapping[str, Array]) -> None:
+def _check_derived(stored: Mapping[str, Array], computed: Mapping[str, Array]) -> None:
+    """The motions and the scales are what follows from the rest."""
     for path in ("/lut/moved_from_scan", "/raw/moved_from_scan"):
         if not np.allclose(stored[path], computed[path], rtol=0.0, atol=_FORMULA_TOLERANCE, equal_nan=True):
             raise ValueError(f"{path}: does not follow from the coordinates and the frames")
+    for path in SCALES.values():
+        if path in stored and not np.array_equal(stored[path], computed[path]):
+            raise ValueError(f"{path}: does not number the values along {path.rpartition('/')[2]}")

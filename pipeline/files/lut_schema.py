@@ -23,7 +23,9 @@ from pipeline.kinematics.table import CurveFit, Grid, LutTable, PoseTable, RawTa
 Array = NDArray[Any]
 
 FORMAT = "ct2lut"
-VERSION = "1.0"
+#: 1.1 gave every dimension a scale; a reader of 1.0 passes over what it does not know.
+MINOR = 1
+VERSION = f"1.{MINOR}"
 BASIS = "chebyshev"
 
 #: Names of the status values, in order of the values.
@@ -32,14 +34,9 @@ FLAGS = ("ok", "smoothed", "slid_off", "rotation_bound", "no_contact", "not_conv
 #: Dimensions that are the same in every table.
 FIXED_SIZES = {"row": 4, "column": 4, "xyz": 3, "corner": 3, "end": 2, "coordinate": 6, "driven": 2}
 
-#: Dimensions with a scale (named coordinates of CF readers) and where the scale lies.
-SCALES = {
-    "flexion_deg": "/grid/flexion_deg",
-    "varus_deg": "/grid/varus_deg",
-    "row": "/row",
-    "column": "/column",
-}
-
+#: Names of the driven coordinates, of the ends of a range, and of the coordinates of the scan pose, in their order.
+_DRIVEN = ("flexion_deg", "varus_deg")
+_SCAN_POSE = (*_DRIVEN, "internal_rotation_deg", "lateral_mm", "anterior_mm", "proximal_mm")
 
 #: Attributes of the file and of ``/smoothing`` that are read back.
 FILE_TEXTS = ("joint", "side", "software")
@@ -49,7 +46,7 @@ SEALED_TEXTS = (*FILE_TEXTS, *SMOOTHING_TEXTS)
 
 @dataclass(frozen=True)
 class DatasetSpec:
-    """One dataset: absolute path, numpy type, names of its dimensions, unit, short name and full meaning."""
+    """One dataset: absolute path, numpy type, names of its dimensions, unit, names; the minor version it came with."""
 
     path: str
     dtype: str
@@ -57,6 +54,17 @@ class DatasetSpec:
     unit: str
     title: str
     meaning: str
+    since: int
+
+    @property
+    def group(self) -> str:
+        """The group it lies in."""
+        return self.path.rpartition("/")[0] or "/"
+
+    @property
+    def is_scale(self) -> bool:
+        """Whether it is the scale of its one dimension: the named coordinate of CF readers."""
+        return self.dims == (self.path.rpartition("/")[2],)
 
     @property
     def fill(self) -> float | int:
@@ -102,7 +110,7 @@ _LAYOUT = """
 /smoothing/flexion_range_deg f8 end                   deg flexion range: ends that the basis scales to -1 and 1
 /smoothing/varus_range_deg   f8 end                   deg varus range: ends that the basis scales to -1 and 1
 /smoothing/contact_error_mm  f8 flexion_deg,varus_deg mm  contact error: signed way to contact, gap + (along delta)
-/smoothing/midpoint_error_mm f8 flexion_interval,varus_deg mm  midpoint error: the same half-way in flexion
+/smoothing/midpoint_error_mm f8 flexion_midpoint_deg,varus_deg mm  midpoint error: the same half-way in flexion
 /frames/scan_from_reference  f8 row,column            mm  reference frame: x lateral, y anterior, z proximal
 /frames/scan_from_moving     f8 row,column            mm  moving frame: x lateral, y anterior, z delta
 /frames/delta                f8 xyz                   1   delta: direction of the push, scan space, at the scan pose
@@ -112,6 +120,22 @@ _LAYOUT = """
 /bodies/moving/points        f8 moving_point,xyz      mm  vertices: of the moving body, scan space, as scanned
 /bodies/moving/triangles     i4 moving_triangle,corner 1   triangles: vertex indices, outward normals
 """
+#: What 1.1 added, all of it scales.
+_LAYOUT_1 = """
+/xyz                         i4 xyz                   1   axis of scan space: to the left, posterior, superior
+/corner                      i4 corner                1   corner: of a triangle
+/smoothing/curve             i4 curve                 1   curve: found coordinate that was smoothed
+/smoothing/driven            i4 driven                1   driven coordinate: flexion, varus
+/smoothing/end               i4 end                   1   end of a range: first, last
+/smoothing/flexion_order     i4 flexion_order         1   order in flexion: p of T_p
+/smoothing/varus_order       i4 varus_order           1   order in varus: q of T_q
+/smoothing/flexion_midpoint_deg f8 flexion_midpoint_deg deg flexion half-way: between two flexions of the grid
+/frames/coordinate           i4 coordinate            1   coordinate: of the scan pose
+/bodies/reference/reference_point i4 reference_point  1   vertex: index that the triangles use
+/bodies/reference/reference_triangle i4 reference_triangle 1 triangle: index
+/bodies/moving/moving_point  i4 moving_point          1   vertex: index that the triangles use
+/bodies/moving/moving_triangle i4 moving_triangle     1   triangle: index
+"""
 
 #: Fields of RawTable that are arrays of their own.
 _RAW_ONLY = tuple(field.name for field in fields(RawTable) if field.name not in ("grid", "poses"))
@@ -119,15 +143,38 @@ _RAW_ONLY = tuple(field.name for field in fields(RawTable) if field.name not in 
 _NEUTRAL = tuple(field.name for field in fields(NeutralCurve) if field.name != "flexion_deg")
 
 
-def _specs(line: str) -> Iterator[DatasetSpec]:
+def _specs(line: str, since: int) -> Iterator[DatasetSpec]:
     path, dtype, dims, unit, text = line.split(maxsplit=4)
     title, _, meaning = text.partition(": ")
     for full in (path.replace("*", "/lut"), path.replace("*", "/raw")) if path.startswith("*") else (path,):
-        yield DatasetSpec(full, dtype, tuple(dims.split(",")), unit, title, meaning)
+        yield DatasetSpec(full, dtype, tuple(dims.split(",")), unit, title, meaning, since)
 
 
-#: Every dataset of version 1, in the order it is written.
-DATASETS: tuple[DatasetSpec, ...] = tuple(spec for line in _LAYOUT.strip().splitlines() for spec in _specs(line))
+#: Every dataset of version 1.
+DATASETS: tuple[DatasetSpec, ...] = tuple(
+    spec
+    for since, layout in enumerate((_LAYOUT, _LAYOUT_1))
+    for line in layout.strip().splitlines()
+    for spec in _specs(line, since)
+)
+#: Every dimension and the path of its scale.
+SCALES = {spec.dims[0]: spec.path for spec in DATASETS if spec.is_scale}
+
+#: Groups that held a link to each grid axis in 1.0.
+_GRID_LINKED_IN = ("/", "/lut", "/raw", "/smoothing")
+
+
+def links(minor: int) -> dict[str, str]:
+    """Hard links, path -> path it leads to, so that each group has the coordinates of its data in itself.
+
+    Neutral varus has a second name: where groups are read as a tree, the grid's varus hides the first.
+    """
+    linked = [(group, axis) for group in _GRID_LINKED_IN for axis in _DRIVEN]
+    if minor >= 1:
+        linked += [(spec.group, dim) for spec in DATASETS for dim in spec.dims]
+    places = {f"{group.rstrip('/')}/{dim}": SCALES[dim] for group, dim in linked}
+    second = {"/neutral/neutral_varus_deg": "/neutral/varus_deg"} if minor >= 1 else {}
+    return second | {place: scale for place, scale in places.items() if place != scale}
 
 
 def root_attributes(content: LutFileContent) -> dict[str, str]:
@@ -156,6 +203,18 @@ def smoothing_attributes(content: LutFileContent) -> dict[str, str]:
     }
 
 
+def value_names(content: LutFileContent) -> dict[str, tuple[str, ...]]:
+    """Names of the values 0, 1, 2 ... of the datasets that number things, by path."""
+    return {
+        **{f"/{group}/status": FLAGS for group in ("lut", "raw", "neutral")},
+        "/xyz": ("x", "y", "z"),
+        "/frames/coordinate": _SCAN_POSE,
+        "/smoothing/curve": tuple(fit.name for fit in content.smooth.fits),
+        "/smoothing/driven": _DRIVEN,
+        "/smoothing/end": ("first", "last"),
+    }
+
+
 def text_checksum(texts: Mapping[str, str]) -> int:
     """CRC-32 of :data:`SEALED_TEXTS`: HDF5 keeps texts where it has no checksum of its own."""
     return zlib.crc32("\n".join(f"{name}={texts[name]}" for name in SEALED_TEXTS).encode())
@@ -167,8 +226,6 @@ def arrays_of(content: LutFileContent) -> dict[str, Array]:
     arrays: dict[str, Array] = {
         "/grid/flexion_deg": smooth.grid.flexion_deg,
         "/grid/varus_deg": smooth.grid.varus_deg,
-        "/row": np.arange(4, dtype=np.int32),
-        "/column": np.arange(4, dtype=np.int32),
         "/smoothing/contact_error_mm": smooth.contact_error_mm,
         "/smoothing/midpoint_error_mm": smooth.midpoint_error_mm,
         "/frames/scan_from_reference": content.scan_from_reference,
@@ -184,7 +241,21 @@ def arrays_of(content: LutFileContent) -> dict[str, Array]:
     arrays |= {f"/neutral/{name}": getattr(content.neutral, name) for name in _NEUTRAL}
     for name, body in (("reference", content.reference_body), ("moving", content.moving_body)):
         arrays |= {f"/bodies/{name}/points": body.points, f"/bodies/{name}/triangles": body.triangles}
-    return arrays | _fit_arrays(smooth)
+    arrays |= _fit_arrays(smooth)
+    return arrays | _scale_arrays(arrays)
+
+
+def _scale_arrays(arrays: Mapping[str, Array]) -> dict[str, Array]:
+    """Values of the scales: half-way between the flexions of the grid, and plain indices."""
+    sizes = {
+        dim: size
+        for spec in DATASETS
+        if spec.path in arrays
+        for dim, size in zip(spec.dims, arrays[spec.path].shape, strict=True)
+    }
+    indices = {path: np.arange(sizes[dim], dtype=np.int32) for dim, path in SCALES.items() if path not in arrays}
+    flexion = arrays["/grid/flexion_deg"]
+    return indices | {SCALES["flexion_midpoint_deg"]: (flexion[:-1] + flexion[1:]) / 2.0}
 
 
 def _fit_arrays(smooth: SmoothTable) -> dict[str, Array]:

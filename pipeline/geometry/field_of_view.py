@@ -1,7 +1,7 @@
 """What of a knee a scan shows: how much of either shaft, how far apart the bones are, which side, how much metal.
 
-A quick look for :mod:`pipeline.quick_look`: everything is counted in layers of voxels across the axis nearest to the
-body's, without a surface, so that a coarse copy of a CT will do.
+For ``ct2lut check``: everything is counted in layers of voxels across the axis nearest to the body's, without a
+surface, so that a coarse copy of a CT will do.
 """
 
 from __future__ import annotations

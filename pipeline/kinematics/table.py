@@ -26,6 +26,21 @@ class Status(IntEnum):
         """Whether the pose of the cell may be shown."""
         return self <= Status.SMOOTHED
 
+    @property
+    def words(self) -> str:
+        """What became of the cell, for people."""
+        return _STATUS_WORDS[self]
+
+
+_STATUS_WORDS = {
+    Status.OK: "stable pose found",
+    Status.SMOOTHED: "filled by smoothing",
+    Status.SLID_OFF: "slid off",
+    Status.ROTATION_BOUND: "rotated to its bound",
+    Status.NO_CONTACT: "no contact",
+    Status.NOT_CONVERGED: "search did not end",
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Grid:

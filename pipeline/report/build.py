@@ -1,27 +1,32 @@
-"""The report page: one self-contained HTML file, the same bytes for the same result."""
+"""The report: one self-contained HTML file and the same on paper, the same bytes for the same result."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from importlib import metadata, resources
+from importlib import metadata
 from typing import Any
 
-import numpy as np
-
 from pipeline import __version__
+from pipeline.adapters.pdf import pdf
 from pipeline.engine.stage import Findings
 from pipeline.records import CaseFacts, SurfaceOrigin, Verdict
-from pipeline.report.evidence import CURVES, STATUS_WORDS, Evidence, cell, neutral_varus, plain, shown_flexions
+from pipeline.report.evidence import CURVES, Evidence, cell, neutral_varus, shown_flexions
 from pipeline.report.figure_frame import RESEARCH_USE
 from pipeline.report.figure_viewer import content_policy, scripts, viewer_data
 from pipeline.report.figures import Drawn
+from pipeline.report.motion import MOTION
 from pipeline.report.settings import PictureSettings
+from pipeline.report.sign_off import review_facts
+from pipeline.report.templates import environment, number, plain
 
 TEMPLATE = "report.html.j2"
 STYLE = "report.css"
+#: What the page is put together from, beside the parts that are another module's.
+PAGE_FILES = (TEMPLATE, STYLE, "meaning.html.j2")
 #: Packages whose version can change a number or a picture.
 PACKAGES = ("numpy", "scipy", "vtk", "python-fcl", "opencv-python-headless", "matplotlib")
 #: Where the bones come from, for the headline.
@@ -33,6 +38,10 @@ ORIGIN_WORDS = {
     "synthesised": "MADE BY THE PROGRAM, not seen in the scan",
     "absent": "absent: bare bone there",
 }
+#: Width over height below which a picture would be too small on half a page of paper.
+TALL = 1.3
+#: How a PNG begins; its width and height are at bytes 16 and 20.
+PNG = b"\x89PNG\r\n\x1a\n"
 BODY_WORDS = {"reference": "stands still", "moving": "moves"}
 
 
@@ -47,37 +56,46 @@ class Page:
     settings: PictureSettings
 
 
-def report_files(page: Page) -> dict[str, bytes]:
-    """The report as files: ``report.html`` and ``images/*.png``."""
-    images = {f"images/{item.figure.name}.png": item.data for item in page.figures if item.data}
-    return {"report.html": report_html(page), **images}
+def picture_files(page: Page) -> dict[str, bytes]:
+    """The pictures and the film as files below ``images/``."""
+    return {item.figure.file: item.data for item in page.figures if item.data}
 
 
 def report_html(page: Page) -> bytes:
     """The page with its pictures embedded; every text from a case is escaped."""
-    import jinja2  # noqa: PLC0415  - a cached run does not need it
-    import markupsafe  # noqa: PLC0415  - the same
+    return _rendered(page, paper=False).encode()
 
-    environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(_resource), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
-    )
-    environment.filters["plain"] = plain
-    environment.filters["number"] = number
+
+def report_pdf(page: Page) -> bytes:
+    """The same page on paper, PDF/A: without what moves, with case, side and notice on every sheet.
+
+    Raises
+    ------
+    EnvironmentFault
+        ``E-ENV-12`` when this machine cannot set text.
+    """
+    return pdf(_rendered(page, paper=True))
+
+
+def _rendered(page: Page, *, paper: bool) -> str:
+    context = _context(page) if paper else _context(page) | _moving(page)
+    return environment().get_template(TEMPLATE).render(context, paper=paper)
+
+
+def _moving(page: Page) -> dict[str, Any]:
+    """What only a browser shows: data and scripts of the model that can be moved, and the policy that lets them run."""
+    import markupsafe  # noqa: PLC0415  - a cached run does not need it
+
     # our own constant files; every text from a case goes through the escaping of the template
     library, module = (markupsafe.Markup(text) for text in scripts())  # noqa: S704
-    return environment.get_template(TEMPLATE).render(**_context(page), library=library, module=module).encode()
-
-
-def _resource(name: str) -> str:
-    return resources.files("pipeline.report").joinpath(name).read_text(encoding="utf-8")
+    viewer = viewer_data(page.evidence, page.settings)
+    return {"policy": content_policy(scripts()), "viewer": viewer, "library": library, "module": module}
 
 
 def _context(page: Page) -> dict[str, Any]:
     evidence = page.evidence
     return {
         "style": STYLE,
-        "policy": content_policy(scripts()),
-        "viewer": viewer_data(evidence, page.settings),
         "research_use": RESEARCH_USE,
         "software": f"ct2lut {__version__}",
         "packages": [(name, metadata.version(name)) for name in PACKAGES],
@@ -85,12 +103,15 @@ def _context(page: Page) -> dict[str, Any]:
         "origin_of_bones": SOURCE_WORDS[evidence.facts.source],
         "sources": _sources(evidence.facts.source_files),
         "anatomy": evidence.anatomy,
+        "sweep": evidence.sweep,
         "mesh_quality": evidence.mesh_quality,
         "verdict": page.verdict,
+        "review": review_facts(evidence, page.verdict),
         "more_reasons": _count_of_reviews(page) - len(page.verdict.reasons),
         "origins": [_origin_row(origin, evidence.facts) for origin in evidence.origins],
         "made": [plain(o.structure) for o in evidence.origins if o.origin == "synthesised"],
-        "figures": [_figure(item) for item in page.figures],
+        "figures": [_figure(item) for item in page.figures if item.figure != MOTION],
+        "motion": next((_figure(item) for item in page.figures if item.figure == MOTION), None),
         "curves": CURVES,
         "table": table_rows(evidence, page.settings),
         "findings": [(name, found) for name, found in evidence.findings.items()] + [("qa", page.findings)],
@@ -122,9 +143,17 @@ def _sources(files: Mapping[str, str]) -> list[tuple[str, str]]:
 
 
 def _figure(item: Drawn) -> dict[str, Any]:
-    source = "data:image/png;base64," + base64.b64encode(item.data).decode() if item.data else ""
-    caption = asdict(item.figure.caption)
-    return {"title": item.figure.title, "caption": caption, "source": source, "problem": item.problem}
+    source = f"data:{item.figure.media};base64,{base64.b64encode(item.data).decode()}" if item.data else ""
+    words = {"title": item.figure.title, "caption": asdict(item.figure.caption), "problem": item.problem}
+    return {**words, "source": source, "tall": _is_tall(item.data)}
+
+
+def _is_tall(picture: bytes) -> bool:
+    """Whether a PNG is so high that on paper it gets more than half of a page; no for what is no PNG."""
+    if not picture.startswith(PNG):
+        return False
+    width, height = struct.unpack(">II", picture[16:24])
+    return bool(width < TALL * height)
 
 
 def table_rows(evidence: Evidence, settings: PictureSettings) -> list[list[str]]:
@@ -136,13 +165,5 @@ def table_rows(evidence: Evidence, settings: PictureSettings) -> list[list[str]]
         for j in varus:
             here = cell(table, i, j)
             values = [number(float(getattr(table.poses, name)[i, j]), 2) for name, _, _ in CURVES]
-            rows.append([f"{here.flexion_deg:g}", f"{here.varus_deg:g}", *values, STATUS_WORDS[here.status]])
+            rows.append([f"{here.flexion_deg:g}", f"{here.varus_deg:g}", *values, here.status.words])
     return rows
-
-
-def number(value: float, digits: int | None = None) -> str:
-    """A number for people: ``digits`` decimals, or three significant ones; a dash for what is not known."""
-    if not np.isfinite(value):
-        return "–"
-    text = f"{value:.{digits}f}" if digits is not None else f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
-    return "0" + text[2:] if text.startswith("-0") and not float(text) else text

@@ -9,13 +9,13 @@ import numpy as np
 
 from pipeline import __version__
 from pipeline.adapters.plotting import Chart, Curve, charts_png
-from pipeline.comparison import Comparison
+from pipeline.kinematics.comparison import Comparison
 from pipeline.kinematics.interpolation import FOUND
-from pipeline.report.build import number
 from pipeline.report.evidence import CURVES, neutral_varus
 from pipeline.report.figure_curves import FLEXION, MAX_CURVES
 from pipeline.report.figure_frame import RESEARCH_USE
 from pipeline.report.palette import hexadecimal, scale
+from pipeline.report.templates import environment
 
 TEMPLATE = "comparison.html.j2"
 FIRST_COLOR, SECOND_COLOR = "#0072b2", "#d55e00"
@@ -47,19 +47,11 @@ class ComparisonPage:
 
 def comparison_html(page: ComparisonPage) -> bytes:
     """The page with its pictures embedded; every text from a table is escaped."""
-    import jinja2  # noqa: PLC0415 - only this command needs it
-
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("pipeline", "report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-    )
-    environment.filters["number"] = number
     grid, found = page.comparison.grid, {curve.name: curve for curve in page.comparison.curves}
     pictures = {"Both motions at neutral varus": motions_png(page), "The difference": differences_png(page)}
     return (
-        environment.get_template(TEMPLATE)
+        environment()
+        .get_template(TEMPLATE)
         .render(
             research_use=RESEARCH_USE,
             software=f"ct2lut {__version__}",

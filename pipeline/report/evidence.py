@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,9 @@ from pipeline.kinematics.neutral import NeutralCurve
 from pipeline.kinematics.table import Grid, RawTable, SmoothTable, Status
 from pipeline.records import Anatomy, CaseFacts, MeshQuality, ScanReturn, SurfaceOrigin, SweepFacts
 
+if TYPE_CHECKING:
+    from pipeline.report.contact_paths import ContactPath
+
 Float = NDArray[np.float64]
 
 #: The four coordinates that are found, in the order of every table and plot: field, title, unit.
@@ -25,16 +30,6 @@ CURVES = (
     ("proximal_mm", "Proximal shift", "mm"),
     ("internal_rotation_deg", "Internal rotation", "deg"),
 )
-
-#: Status -> words for people.
-STATUS_WORDS = {
-    Status.OK: "stable pose found",
-    Status.SMOOTHED: "filled by smoothing",
-    Status.SLID_OFF: "slid off",
-    Status.ROTATION_BOUND: "rotated to its bound",
-    Status.NO_CONTACT: "no contact",
-    Status.NOT_CONVERGED: "search did not end",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +65,13 @@ class Evidence:
     def scan_from_moving(self) -> Float:
         """(4, 4) kinematic frame of the moving body."""
         return np.asarray(self.anatomy.scan_from_moving, dtype=np.float64)
+
+    @cached_property
+    def contact_paths(self) -> tuple[ContactPath, ...]:
+        """Where contact wanders at neutral varus; found once, for the numbers and for the picture."""
+        from pipeline.report.contact_paths import contact_paths  # noqa: PLC0415 - it is made of this evidence
+
+        return contact_paths(self)
 
 
 @dataclass(frozen=True)
@@ -126,8 +128,3 @@ def cell_motion(evidence: Evidence, shown: Cell) -> Float:
         float(poses.proximal_mm[at]),
     )
     return moved_from_scan(evidence.scan_from_reference, evidence.scan_from_moving, pose)
-
-
-def plain(name: str) -> str:
-    """A name of ours in words."""
-    return name.replace("_", " ")

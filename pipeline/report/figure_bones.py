@@ -11,10 +11,11 @@ from pipeline.adapters import pictures
 from pipeline.adapters.pictures import BOLD, Color, Image, Text
 from pipeline.adapters.rendering import Surface, snapshots
 from pipeline.geometry.views import Direction, View, view
-from pipeline.report.evidence import Evidence, plain
+from pipeline.report.evidence import Evidence
 from pipeline.report.figure_frame import MARGIN_PX, finished, mark_edges, title_panel
 from pipeline.report.palette import AXIS, DELTA, structure_color
 from pipeline.report.settings import PictureSettings
+from pipeline.report.templates import plain
 
 Float = NDArray[np.float64]
 

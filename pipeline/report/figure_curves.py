@@ -1,4 +1,4 @@
-"""Pictures: the found coordinates against flexion, and the checks of contact and repeatability."""
+"""Picture: the found coordinates against flexion, at several varus."""
 
 from __future__ import annotations
 
@@ -8,21 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.adapters.plotting import Chart, Curve, charts_png
-from pipeline.kinematics.interpolation import usable_entries
 from pipeline.kinematics.table import Status
-from pipeline.report.evidence import CURVES, STATUS_WORDS, Evidence, neutral_varus
+from pipeline.report.evidence import CURVES, Evidence, neutral_varus
 from pipeline.report.figure_frame import RESEARCH_USE, heading
-from pipeline.report.palette import hexadecimal, scale
-from pipeline.report.settings import Limits
+from pipeline.report.palette import VERMILION, hexadecimal, scale
 
 Float = NDArray[np.float64]
 
 FLEXION = "Flexion (deg)"
-SCAN_COLOR = "#d55e00"
-BAND_COLOR = "#009e73"
-#: Internal rotation by 30 deg of flexion in healthy knees, deg: shown for comparison, never fitted to.
-ROTATION_BAND_DEG = (0.0, 13.0)
-ROTATION_BAND_AT_DEG = 30.0
 _STATUS_COLORS = {
     Status.SLID_OFF: "#d55e00",
     Status.ROTATION_BOUND: "#cc79a7",
@@ -61,19 +54,17 @@ def _chart(evidence: Evidence, name: str, title: str, unit: str) -> Chart:
         label = f"varus {evidence.smooth.grid.varus_deg[j]:g} deg"
         curves.append(Curve(evidence.raw.grid.flexion_deg, raw[:, j], color, "dots"))
         curves.append(Curve(flexion, smooth[:, j], color, "line", label))
-    if name == "internal_rotation_deg" and flexion[0] < ROTATION_BAND_AT_DEG < flexion[-1]:
-        at = np.full(2, ROTATION_BAND_AT_DEG)
-        curves.append(Curve(at, np.array(ROTATION_BAND_DEG), BAND_COLOR, "bar", "healthy knees at 30 deg"))
-    curves += [*_scan_mark(evidence, name), *_status_marks(evidence, smooth)]
+    curves += [*scan_mark(evidence, name), *_status_marks(evidence, smooth)]
     return Chart(f"{title} ({unit})", FLEXION, unit, curves)
 
 
-def _scan_mark(evidence: Evidence, name: str) -> Iterator[Curve]:
+def scan_mark(evidence: Evidence, name: str) -> Iterator[Curve]:
+    """The scan's own value of a coordinate, where the table reaches its flexion."""
     flexion, _, rotation, *shift = evidence.anatomy.scan_attitude
     grid = evidence.smooth.grid.flexion_deg
     if grid[0] <= flexion <= grid[-1]:
         value = dict(zip([field for field, _, _ in CURVES], [*shift, rotation], strict=True))[name]
-        yield Curve(np.array([flexion]), np.array([value]), SCAN_COLOR, "star", "the scan itself")
+        yield Curve(np.array([flexion]), np.array([value]), VERMILION, "star", "the scan itself")
 
 
 def _status_marks(evidence: Evidence, values: Float) -> Iterator[Curve]:
@@ -84,43 +75,4 @@ def _status_marks(evidence: Evidence, values: Float) -> Iterator[Curve]:
     for kind, color in _STATUS_COLORS.items():
         at = evidence.smooth.grid.flexion_deg[(status == kind).any(axis=1)]
         if len(at):
-            yield Curve(at, np.full(len(at), foot), color, "cross", f"no pose: {STATUS_WORDS[kind]}")
-
-
-def checks_png(evidence: Evidence, limits: Limits) -> bytes:
-    """Contact after smoothing with its limit, hysteresis, and the gap of each side against flexion, as PNG.
-
-    Raises
-    ------
-    ValueError
-        When no entry of the table is usable.
-    """
-    if not usable_entries(evidence.smooth.poses).any():
-        raise ValueError("no entry of the table is usable")
-    raw, smooth = evidence.raw, evidence.smooth
-    middles = (smooth.grid.flexion_deg[1:] + smooth.grid.flexion_deg[:-1]) / 2.0
-    flexion, poses = smooth.grid.flexion_deg, smooth.poses
-    limit = [_limit_line(flexion, sign * limits.max_midpoint_error_mm) for sign in (1.0, -1.0)]
-    between = [*_lines(evidence, middles, smooth.midpoint_error_mm), *limit]
-    charts = [
-        Chart("Contact error between entries: + gap, - overlap", FLEXION, "mm", between),
-        Chart(
-            "Hysteresis: way out against way back",
-            FLEXION,
-            "mm",
-            _lines(evidence, raw.grid.flexion_deg, raw.hysteresis_mm),
-        ),
-        Chart("Gap of the medial side", FLEXION, "mm", _lines(evidence, flexion, poses.medial_gap_mm)),
-        Chart("Gap of the lateral side", FLEXION, "mm", _lines(evidence, flexion, poses.lateral_gap_mm)),
-    ]
-    return charts_png(f"{heading(evidence.facts)}  |  Checks", RESEARCH_USE, charts)
-
-
-def _lines(evidence: Evidence, flexion: Float, values: Float) -> list[Curve]:
-    varus = evidence.smooth.grid.varus_deg
-    colors = varus_colors(evidence)
-    return [Curve(flexion, values[:, j], color, "line", f"varus {varus[j]:g} deg") for j, color in colors.items()]
-
-
-def _limit_line(flexion: Float, value: float) -> Curve:
-    return Curve(flexion[[0, -1]], np.full(2, value), SCAN_COLOR, "dashed", f"limit {abs(value):g} mm")
+            yield Curve(at, np.full(len(at), foot), color, "cross", f"no pose: {kind.words}")

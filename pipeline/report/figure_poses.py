@@ -12,11 +12,12 @@ from pipeline.adapters.pictures import Color, Image, Text
 from pipeline.adapters.rendering import Surface, distances_mm, snapshots
 from pipeline.geometry.mesh import TriangleMesh, transformed
 from pipeline.geometry.views import View, view
-from pipeline.report.evidence import STATUS_WORDS, Cell, Evidence, cell_motion, plain, shown_cells
+from pipeline.report.evidence import Cell, Evidence, cell_motion, shown_cells
 from pipeline.report.figure_bones import SIDES, half_height_mm
 from pipeline.report.figure_frame import finished, mark_edges, title_panel, words_panel
 from pipeline.report.palette import BONE, MOVING, OVERLAP, scale, structure_color
 from pipeline.report.settings import PictureSettings
+from pipeline.report.templates import plain
 
 Float = NDArray[np.float64]
 
@@ -65,7 +66,7 @@ def _title(cell: Cell) -> str:
 
 
 def _no_pose(cell: Cell, size: int) -> Image:
-    panel = words_panel(size, ["No stable pose here:", STATUS_WORDS[cell.status]])
+    panel = words_panel(size, ["No stable pose here:", cell.status.words])
     title_panel(panel, _title(cell))
     return panel
 
@@ -129,7 +130,7 @@ def contact_picture(evidence: Evidence, settings: PictureSettings) -> Image:
         When no attitude that is shown has a pose.
     """
     cells = _usable_cells(evidence, settings)
-    seen = _from_above(evidence)
+    seen = from_above(evidence)
     colors = _contact_colors(evidence, settings, cells)
     panels = [_contact_panel(evidence, settings, cell, seen, colors.get(cell)) for cell in cells]
     bar = pictures.color_bar(scale(np.linspace(0.0, 1.0, 256)), _bar_labels(settings), panels[0].shape[1] * 2)
@@ -138,7 +139,7 @@ def contact_picture(evidence: Evidence, settings: PictureSettings) -> Image:
     return finished(evidence.facts, title, [pictures.tiled([panels]), bar], legend)
 
 
-def _from_above(evidence: Evidence) -> View:
+def from_above(evidence: Evidence) -> View:
     """The top of the moving body seen along delta, all of it on the picture."""
     frame = evidence.scan_from_moving
     local = (evidence.moving.points - frame[:3, 3]) @ frame[:3, :3]

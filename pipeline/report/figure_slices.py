@@ -10,10 +10,11 @@ from pipeline.adapters.pictures import Image
 from pipeline.geometry.sections import plane_section, volume_slice
 from pipeline.geometry.views import Direction, View, view
 from pipeline.geometry.volume import CtVolume
-from pipeline.report.evidence import Evidence, plain
+from pipeline.report.evidence import Evidence
 from pipeline.report.figure_frame import finished, mark_edges, title_panel
 from pipeline.report.palette import structure_color
 from pipeline.report.settings import PictureSettings
+from pipeline.report.templates import plain
 
 Float = NDArray[np.float64]
 

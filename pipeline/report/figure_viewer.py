@@ -19,18 +19,20 @@ from pipeline.adapters.decimation import decimate_quadric
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.kinematics.interpolation import FOUND, found_coordinates
 from pipeline.kinematics.table import LutTable, Status
-from pipeline.report.evidence import STATUS_WORDS, Evidence, plain
+from pipeline.report.evidence import Evidence
 from pipeline.report.figure_bones import AXIS_SHARE, DELTA_SHARE, half_height_mm
 from pipeline.report.figure_frame import RESEARCH_USE, heading
 from pipeline.report.palette import AXIS, BONE, DELTA, MOVING, Color, hexadecimal, scale, structure_color
 from pipeline.report.settings import PictureSettings
+from pipeline.report.templates import plain
 
 Float = NDArray[np.float64]
 
-#: What is put into the page, in the order in which it runs: two scripts, the second of three files.
+#: What is put into the page, in the order in which it runs: two scripts, the second of several files.
 LIBRARY = "viewer/three.min.js"
-MODULE = ("viewer/player.js", "viewer/contact.js", "viewer/viewer.js")
-VIEWER_FILES = (LIBRARY, *MODULE)
+MODULE = ("viewer/player.js", "viewer/contact.js", "viewer/sign_off.js", "viewer/ghost.js", "viewer/viewer.js")
+#: All that is put into the page from here; a change of one makes the page anew.
+VIEWER_FILES = (LIBRARY, *MODULE, "viewer.html.j2", "sign_off.html.j2", "reader.css")
 #: Triangles of all meshes together.
 TRIANGLES = 24_000
 #: Fewest of one mesh: a meniscus beside large bones stays a meniscus.
@@ -56,7 +58,8 @@ def content_policy(allowed: Iterable[str]) -> str:
     """Content security policy of a page that loads nothing and runs exactly the scripts of these texts."""
     hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in allowed]
     sources = " ".join(f"'sha256-{one}'" for one in hashes)
-    return f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {sources}"
+    nothing = "default-src 'none'; base-uri 'none'; form-action 'none'"
+    return f"{nothing}; img-src data:; style-src 'unsafe-inline'; media-src data:; script-src {sources}"
 
 
 def viewer_data(evidence: Evidence, settings: PictureSettings) -> dict[str, Any]:
@@ -64,9 +67,10 @@ def viewer_data(evidence: Evidence, settings: PictureSettings) -> dict[str, Any]
     reference = evidence.scan_from_reference
     return {
         "heading": heading(evidence.facts),
+        "joint": evidence.facts.joint,
         "notice": RESEARCH_USE,
         "lut": player_data(_table(evidence)),
-        "status_words": [STATUS_WORDS[status] for status in Status],
+        "status_words": [status.words for status in Status],
         "usable": [int(status) for status in Status if status.usable],
         "parts": _parts(evidence, settings),
         "contact": {"range_mm": settings.contact_range_mm, "colors": contact_colors()},

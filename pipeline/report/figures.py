@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from pipeline.adapters.pictures import png
 from pipeline.report.evidence import Evidence
 from pipeline.report.figure_bones import bones_picture
-from pipeline.report.figure_curves import checks_png, curves_png
+from pipeline.report.figure_checks import checks_png, repeatability_known, repeats_png
+from pipeline.report.figure_curves import curves_png
+from pipeline.report.figure_neutral import baselines_png, neutral_png
+from pipeline.report.figure_paths import paths_png
 from pipeline.report.figure_poses import contact_picture, poses_picture
 from pipeline.report.figure_slices import slices_picture
 from pipeline.report.settings import Limits, PictureSettings
@@ -26,21 +30,28 @@ class Caption:
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture of the report: file name without ending, title, caption, and how it is drawn (PNG bytes)."""
+    """A picture of the report: file name without ending, title, caption, how it is drawn, and what the bytes are."""
 
     name: str
     title: str
     caption: Caption
     draw: Callable[[Evidence, PictureSettings, Limits], bytes]
+    media: str = "image/png"
+
+    @property
+    def file(self) -> str:
+        """Name of its file in the report, such as ``images/bones.png``."""
+        return f"images/{self.name}.{self.media.rpartition('/')[2]}"
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure and its PNG bytes, or empty bytes and why there are none."""
+    """A figure and its bytes, or empty bytes and why there are none; how long it took is no part of the page."""
 
     figure: Figure
     data: bytes
     problem: str = ""
+    seconds: float = field(default=0.0, compare=False)
 
 
 # functions of the module, not lambdas: a figure is sent to a worker process
@@ -66,6 +77,22 @@ def _curves(evidence: Evidence, _: PictureSettings, __: Limits) -> bytes:
 
 def _checks(evidence: Evidence, _: PictureSettings, limits: Limits) -> bytes:
     return checks_png(evidence, limits)
+
+
+def _neutral(evidence: Evidence, _: PictureSettings, __: Limits) -> bytes:
+    return neutral_png(evidence)
+
+
+def _baselines(evidence: Evidence, _: PictureSettings, limits: Limits) -> bytes:
+    return baselines_png(evidence, limits)
+
+
+def _paths(evidence: Evidence, _: PictureSettings, __: Limits) -> bytes:
+    return paths_png(evidence)
+
+
+def _repeats(evidence: Evidence, _: PictureSettings, __: Limits) -> bytes:
+    return repeats_png(evidence)
 
 
 SLICES = Figure(
@@ -123,28 +150,87 @@ CURVES = Figure(
     ),
     _curves,
 )
+NEUTRAL = Figure(
+    "neutral",
+    "At neutral varus, against published motion",
+    Caption(
+        "Each coordinate at neutral varus. Broken lines: simpler motions of these bones, through the pose of the scan. "
+        "Green: how other people's knees, under other loads, change from extension on.",
+        "Dots lie within a narrow blue band. The smoothed line a little below the dots of the proximal shift is usual.",
+        "Grey zones or a wide band: the surfaces hold the joint loosely, the line is one of several possible poses.",
+        "Never tune towards green: it is no target. Where an angle differs beyond the bar of its axes, check them.",
+    ),
+    _neutral,
+)
+BASELINES = Figure(
+    "baselines",
+    "What a motion costs that ignores the surfaces",
+    Caption(
+        "How far these bones overlap (-) or gape (+) along the push on a plain hinge, on a published average motion "
+        "(both through the pose of the scan), and in this table.",
+        "This table runs along zero, within its limits on the right, whatever the others do.",
+        "This table leaves zero; or the hinge overlaps by more than a millimetre already at the flexion of the scan.",
+        "Overlap at the scan: look for cartilage and menisci that overlap in the label map.",
+    ),
+    _baselines,
+)
+PATHS = Figure(
+    "paths",
+    "Where contact wanders on the joint surface",
+    Caption(
+        "Middle of the area of each side that touches or is at most 0.2 mm farther than its nearest point, at neutral "
+        "varus, computed from the smoothed poses. Hollow: the side is open.",
+        "Both paths lie on the joint surface and move on without leaps.",
+        "Leaps between neighbours (often between the horns of a stiff meniscus), paths on a rim, many hollow points.",
+        "Look at the contact picture at that flexion. With several spots of contact the middle may lie between them.",
+    ),
+    _paths,
+)
 CHECKS = Figure(
     "checks",
-    "Contact and repeatability against flexion",
+    "Contact against flexion",
     Caption(
-        "What is left of gap or overlap after smoothing, the gap of each side, and way out against way back.",
-        "Contact error within the dashed lines; at neutral varus both gaps are small; hysteresis near zero.",
-        "Contact error beyond the dashed lines, one side wide open at every varus, hysteresis above 1 mm.",
+        "Gap or overlap that smoothing leaves, at the entries of the table and between them, and the gap of each side.",
+        "Contact within the dashed limits; at neutral varus both gaps are small.",
+        "Contact beyond the dashed limits, or one side wide open at every varus.",
         "Use a finer grid or a higher degree of smoothing where contact is lost; check the axes where a side is open.",
     ),
     _checks,
 )
+REPEATS = Figure(
+    "repeats",
+    "How sure a pose is",
+    Caption(
+        "How bending and straightening differ, how the two solvers of this program differ, and how far a pose can be "
+        "pushed before it slips (stability margin).",
+        "Differences near zero, margins near the most that is tried.",
+        "Differences of millimetres: two poses are equally good there. A margin near zero: a pose on an edge.",
+        "Take the table there as one of several possible poses. Labelled menisci and ligaments hold a joint better.",
+    ),
+    _repeats,
+)
 
 
 def expected_figures(evidence: Evidence) -> tuple[Figure, ...]:
-    """The figures that the report of a case must have; slices where there is a CT or a label map to cut."""
-    rest = (BONES, POSES, CONTACT, CURVES, CHECKS)
-    return rest if evidence.labels is None and evidence.ct_cuts is None else (SLICES, *rest)
+    """The figures that the report of a case must have.
+
+    Slices where there is a CT or a label map to cut, baselines where the sweep was asked for them, and how sure a pose
+    is where anything is known of it.
+    """
+    asked = {
+        SLICES: evidence.labels is not None or evidence.ct_cuts is not None,
+        BASELINES: bool(evidence.sweep.baselines),
+        REPEATS: repeatability_known(evidence),
+    }
+    every = (SLICES, BONES, POSES, CONTACT, PATHS, CURVES, NEUTRAL, BASELINES, CHECKS, REPEATS)
+    return tuple(figure for figure in every if asked.get(figure, True))
 
 
 def drawn(figure: Figure, evidence: Evidence, settings: PictureSettings, limits: Limits) -> Drawn:
     """The figure, or why it cannot be drawn from this evidence (one the drawing refuses with ValueError)."""
+    since = time.perf_counter()
     try:
-        return Drawn(figure, figure.draw(evidence, settings, limits))
+        data, problem = figure.draw(evidence, settings, limits), ""
     except ValueError as error:
-        return Drawn(figure, b"", str(error))
+        data, problem = b"", str(error)
+    return Drawn(figure, data, problem, time.perf_counter() - since)

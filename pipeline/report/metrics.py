@@ -16,8 +16,10 @@ from pipeline.geometry.mesh import TriangleMesh, edge_defects
 from pipeline.kinematics.interpolation import usable_entries
 from pipeline.kinematics.table import RawTable, SmoothTable, Status
 from pipeline.records import CrossCheck, Metric, SweepFacts
-from pipeline.report.evidence import STATUS_WORDS, Evidence, plain
+from pipeline.report.contact_paths import excursion_mm
+from pipeline.report.evidence import Evidence
 from pipeline.report.settings import Limits
+from pipeline.report.templates import plain
 
 Float = NDArray[np.float64]
 
@@ -60,6 +62,7 @@ def all_metrics(evidence: Evidence, limits: Limits) -> tuple[Metric, ...]:
         *_sweep_metrics(evidence, limits),
         *_scan_pose_metrics(evidence),
         *_smooth_metrics(evidence, limits),
+        *_path_metrics(evidence),
     )
 
 
@@ -110,8 +113,8 @@ def _sweep_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
     for status in Status:
         count = int((raw.poses.status == status).sum())
         if count and not status.usable:
-            meaning = f"Attitudes where the search ended so: {STATUS_WORDS[status]}."
-            title = f"Raw entries: {STATUS_WORDS[status]}"
+            meaning = f"Attitudes where the search ended so: {status.words}."
+            title = f"Raw entries: {status.words}"
             yield info(Measured(f"raw_status.{status.name.lower()}", title, float(count), "entries", meaning))
     if found.any():
         meaning = "Pulled back by so much the bones are clear, pushed on by so much they meet: exact test, worst entry."
@@ -215,6 +218,16 @@ def _smooth_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
     meaning = "Usable entries, and middles between two of them, whose contact was not tested."
     yield at_most(Measured("untested", "Untested entries", float(untested(smooth)), "entries", meaning), 0)
     yield from _balance_metrics(evidence)
+
+
+def _path_metrics(evidence: Evidence) -> Iterator[Metric]:
+    for path in evidence.contact_paths:
+        if path.touching.any():
+            meaning = (
+                f"How far the middle of contact wanders forwards and backwards at neutral varus, {path.side} side."
+            )
+            title = f"Path of contact, {path.side} side"
+            yield info(Measured(f"contact_path_{path.side}", title, excursion_mm(path), "mm", meaning))
 
 
 def untested(smooth: SmoothTable) -> int:

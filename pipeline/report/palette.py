@@ -19,6 +19,9 @@ OVERLAP: Color = (213, 94, 0)
 AXIS: Color = (0, 90, 160)
 DELTA: Color = (200, 60, 0)
 
+#: Lines of charts.
+BLUE, VERMILION, PINK, GREEN, AMBER, GREY = "#0072b2", "#d55e00", "#cc79a7", "#009e73", "#e69f00", "#6e6e6e"
+
 _STRUCTURES: dict[str, Color] = {
     "femur": BONE,
     "tibia": MOVING,

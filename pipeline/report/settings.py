@@ -6,6 +6,9 @@ from pydantic import Field
 
 from pipeline.engine.stage import StrictParams
 
+#: Where a report has room for how the run went; a page without it tells why there is no report.
+RUN_MARK = b"<!-- the run -->\n"
+
 
 class Limits(StrictParams):
     """Limits of the verdict; beyond one of them a person has to look."""
@@ -38,6 +41,9 @@ class PictureSettings(StrictParams):
         200.0, gt=1, le=2000, description="most that a panel shows from bottom to top, mm; long shafts are cut"
     )
     contact_range_mm: float = Field(4.0, gt=0, le=50, description="end of the colour scale of the contact maps, mm")
+    motion_poses: int = Field(
+        31, ge=2, le=121, description="poses of the film on the way out; 31 make 61 frames, out and back"
+    )
     carried: list[str] = Field(
         ["fibula"],
         description="structures that go with the moving body though they are not part of its contact surface",

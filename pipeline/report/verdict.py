@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pipeline.engine.stage import Finding, Findings, Severity
 from pipeline.records import Metric, Verdict
 
+#: Units of metrics that count something.
+COUNTED = ("edges", "entries")
 #: What fits on a screen beside the word; every finding stands further down in the report.
 MAX_REASONS = 3
 
@@ -25,7 +27,7 @@ def guarantees() -> dict[str, Guarantee]:
     return {
         "open_edges": Guarantee("W-QA-01", "A surface has holes"),
         "mesh_volume_error": Guarantee("W-QA-02", "A surface is larger or smaller than its label"),
-        "usable_cells": Guarantee("W-QA-03", "Some attitudes have no stable pose"),
+        "usable_cells": Guarantee("W-QA-03", "Some entries of the table stay without a pose"),
         "raw_contact_gap": Guarantee("W-QA-04", "A pose of the sweep is not proven to be in contact"),
         "contact_error": Guarantee("W-QA-05", "An entry of the table leaves a gap or an overlap"),
         "midpoint_error": Guarantee("W-QA-06", "Between two entries of the table a gap or an overlap can be seen"),
@@ -44,8 +46,8 @@ def metric_findings(metrics: Iterable[Metric]) -> Findings:
 
 
 def _numbers(metric: Metric) -> str:
-    title = f"{metric.title[0].lower()}{metric.title[1:]}"
-    return f"{title} {metric.value:.4g} {metric.unit}, expected {metric.limit} {metric.unit}"
+    unit = "" if metric.unit in COUNTED else f" {metric.unit}"
+    return f"{metric.value:.4g} {metric.unit}, expected {metric.limit}{unit}"
 
 
 def picture_findings(missing: Mapping[str, str]) -> Findings:

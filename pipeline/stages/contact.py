@@ -191,7 +191,7 @@ def _described(name: str, result: SurfaceResult) -> Finding:
         Severity.NOTE,
         f"{name.capitalize()} body: {len(result.mesh.triangles)} triangles, {result.deviation.rms_mm:.2f} mm RMS and "
         f"{result.deviation.max_mm:.2f} mm at most from the voxel surface, "
-        f"volume {100 * result.volume_error:+.1f} %.",
+        f"volume {100 * result.volume_error:+z.1f} %.",
     )
 
 

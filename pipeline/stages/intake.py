@@ -23,9 +23,9 @@ from pipeline.files.markups import read_markups
 from pipeline.files.meshes import read_mesh
 from pipeline.files.volumes import LabelMap, check_belongs, read_label_map
 from pipeline.geometry.mesh import TriangleMesh
-from pipeline.label_review import review_unused
-from pipeline.label_scheme import LabelValue, StructureName, number_structures, renumbered, structure_values
-from pipeline.label_taking import take_labels
+from pipeline.labels.review import review_unused
+from pipeline.labels.scheme import LabelValue, StructureName, number_structures, renumbered, structure_values
+from pipeline.labels.taking import take_labels
 from pipeline.records import CaseFacts, LigamentFibre, Side
 
 

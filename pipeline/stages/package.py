@@ -52,7 +52,8 @@ Research use - not for diagnosis.
 
 What is here
   report.html     open this first: verdict, pictures, numbers, what to look for
-  images/         the pictures of the report, one file each
+  report.pdf      the same on paper
+  images/         the pictures and the film of the report, one file each
   lut.h5          the table for programs: poses, contact bodies, frames, proofs (HDF5, format version 1)
   lut.csv         the table for people: one row an attitude
   lut.json        the table for programs without HDF5, with poses to check a reader by; described by lut.schema.json

@@ -29,21 +29,26 @@ from pipeline.artifacts import (
     SWEEP_FACTS,
     VERDICT,
 )
-from pipeline.engine.stage import Findings, Inputs, Outputs, Stage, StrictParams, findings_of
+from pipeline.engine.stage import Findings, Inputs, Outputs, Stage, StrictParams, findings_of, timed
 from pipeline.errors import EnvironmentFault
-from pipeline.report.build import STYLE, TEMPLATE, Page, report_files
+from pipeline.report.build import PAGE_FILES, Page, picture_files, report_html, report_pdf
 from pipeline.report.evidence import Evidence
 from pipeline.report.figure_slices import ct_cuts
 from pipeline.report.figure_viewer import VIEWER_FILES
 from pipeline.report.figures import Drawn, drawn, expected_figures
 from pipeline.report.metrics import all_metrics
+from pipeline.report.motion import TEMPLATE as MOTION_TEMPLATE
+from pipeline.report.motion import expected_motion
 from pipeline.report.settings import Limits, PictureSettings
 from pipeline.report.verdict import judge, metric_findings, picture_findings
 
 FINDINGS = {name: findings_of(name) for name in ("intake", "segment", "mesh", "anatomy", "contact", "sweep", "smooth")}
 
 #: The longest first, and the charts side by side: a worker that has drawn the one has loaded what draws the other.
-DRAWING_ORDER = ("poses", "curves", "checks", "slices", "contact", "bones")
+DRAWING_ORDER = (
+    *("motion", "poses", "neutral", "curves", "checks", "repeats", "baselines"),
+    *("paths", "slices", "contact", "bones"),
+)
 
 
 class Params(StrictParams):
@@ -55,14 +60,20 @@ class Params(StrictParams):
 
 def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     """Measure, draw, judge, and write the report."""
-    evidence = gather(reads, params.pictures)
-    metrics = all_metrics(evidence, params.limits)
+    with timed(out, "what the stages left, and numbers"):
+        evidence = gather(reads, params.pictures)
+        metrics = all_metrics(evidence, params.limits)
     pictures = _draw(evidence, params, out)
     missing = {item.figure.title: item.problem for item in pictures if not item.data}
     findings = (*metric_findings(metrics), *picture_findings(missing))
     verdict = judge(metrics, findings, evidence.findings)
     out[VERDICT] = verdict
-    out[REPORT] = report_files(Page(evidence, verdict, pictures, findings, params.pictures))
+    page = Page(evidence, verdict, pictures, findings, params.pictures)
+    with timed(out, "report.html"):
+        html = report_html(page)
+    with timed(out, "report.pdf"):
+        paper = report_pdf(page)
+    out[REPORT] = {"report.html": html, "report.pdf": paper, **picture_files(page)}
     return findings
 
 
@@ -90,7 +101,7 @@ def gather(reads: Inputs, pictures: PictureSettings) -> Evidence:
 
 
 def _draw(evidence: Evidence, params: Params, out: Outputs) -> list[Drawn]:
-    figures, finished = expected_figures(evidence), count(1)
+    figures, finished = (*expected_figures(evidence), *expected_motion(evidence)), count(1)
     work = partial(drawn, evidence=evidence, settings=params.pictures, limits=params.limits)
     order = sorted(figures, key=lambda figure: DRAWING_ORDER.index(figure.name))
     out.progress(0, len(figures))
@@ -101,7 +112,10 @@ def _draw(evidence: Evidence, params: Params, out: Outputs) -> list[Drawn]:
             # VTK ends the worker that draws where no renderer is installed: then this says so
             require_renderer()
         raise
-    return sorted(found, key=lambda one: figures.index(one.figure))
+    found.sort(key=lambda one: figures.index(one.figure))
+    for one in found:
+        out.took(f"drawing '{one.figure.title}'", one.seconds)
+    return found
 
 
 STAGE = Stage(
@@ -128,5 +142,5 @@ STAGE = Stage(
     writes=(VERDICT, REPORT),
     Params=Params,
     run=run,
-    resources=tuple(f"pipeline.report:{name}" for name in (TEMPLATE, STYLE, *VIEWER_FILES)),
+    resources=tuple(f"pipeline.report:{name}" for name in (*PAGE_FILES, MOTION_TEMPLATE, *VIEWER_FILES)),
 )

@@ -11,9 +11,9 @@ from pipeline.artifacts import CASE_FACTS, CT, GIVEN_FACTS, GIVEN_LABELS, LABELS
 from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage, StrictParams
 from pipeline.errors import CaseRejected
 from pipeline.geometry.volume import CtVolume
-from pipeline.label_fitting import FitLimits, hold_against_ct
+from pipeline.labels.fitting import FitLimits, hold_against_ct
+from pipeline.labels.site import SiteCommand, labels_of_commands, named_twice
 from pipeline.records import CaseFacts
-from pipeline.site_labels import SiteCommand, labels_of_commands, named_twice
 
 if TYPE_CHECKING:
     from pipeline.adapters.bone_segmentation import BoneSegmentation
@@ -65,7 +65,7 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     CaseRejected
         E-SEG-01 when there is no such knee in the CT, E-LBL-08 and E-LBL-09 when labels do not belong to it, E-SEG-08
         when those of the site's programs do not lie on bone; what
-        :func:`pipeline.site_labels.labels_of_commands` raises.
+        :func:`pipeline.labels.site.labels_of_commands` raises.
     """
     facts, labels, ct = reads[GIVEN_FACTS], reads[GIVEN_LABELS], reads[CT]
     if facts.source != "ct":

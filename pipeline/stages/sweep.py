@@ -23,10 +23,10 @@ from pipeline.artifacts import (
 from pipeline.contact_params import ContactParams, fibres_of
 from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage
 from pipeline.errors import CaseRejected
-from pipeline.kinematics.baselines import hinge, probes, walker
+from pipeline.kinematics.baselines import Baseline, hinge, probes, walker
 from pipeline.kinematics.body_frames import scan_pose
 from pipeline.kinematics.contact import Pose
-from pipeline.kinematics.cross_check import Differences, agreeing, differences, rechecks, shallower
+from pipeline.kinematics.cross_check import Recheck, agreeing, differences, rechecks, shallower
 from pipeline.kinematics.direct.settings import DirectSettings, MapSettings
 from pipeline.kinematics.incremental import IncrementalSettings, StablePose
 from pipeline.kinematics.jumps import JumpLimits, Jumps, jumps, mended, to_solve_again
@@ -42,7 +42,17 @@ from pipeline.kinematics.sweep import (
     walk_grid,
 )
 from pipeline.kinematics.table import Grid, RawTable, Status
-from pipeline.records import Anatomy, CrossCheck, JumpCount, LigamentFibre, ScanReturn, SweepFacts
+from pipeline.records import (
+    Anatomy,
+    BaselineCost,
+    BaselineName,
+    CheckedAttitude,
+    CrossCheck,
+    JumpCount,
+    LigamentFibre,
+    ScanReturn,
+    SweepFacts,
+)
 
 MAX_CELLS = 100_000
 
@@ -143,8 +153,10 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
     out[SCAN_RETURNS] = _scan_returns(anatomy, params, joint)
     out[NEUTRAL_CURVE] = joint.neutral(table, anatomy.scan_attitude[1], rest)
 
-    out[SWEEP_FACTS] = facts = _facts(params, (before, jumps(grid, found, limits)), differences(found, asked, answers))
-    return (*_findings(table, facts), *(_baselines(joint, anatomy, grid) if params.baselines else ()))
+    baselines = _baselines(joint, anatomy, grid) if params.baselines else ()
+    check = _cross_check(params, found, asked, answers)
+    out[SWEEP_FACTS] = facts = _facts(params, (before, jumps(grid, found, limits)), check, baselines)
+    return _findings(table, facts)
 
 
 def _wanted(reads: Inputs, params: Params) -> tuple[LigamentFibre, ...]:
@@ -163,7 +175,7 @@ def _nothing_stable(found: Mapping[Place, Found]) -> CaseRejected:
     ends = [one.stable.status for one in found.values()]
     return CaseRejected(
         "E-SWP-01",
-        f"No stable pose at any of {len(ends)} flexions at the varus of the scan: {_counts(ends)}.",
+        f"No stable pose at any of {len(ends)} flexions at the varus of the scan ({_counts(ends)}).",
         "Check that cartilage and menisci are labelled, and that the bones are those of one joint.",
     )
 
@@ -241,7 +253,9 @@ def _settings(params: Params) -> SolverSettings:
     )
 
 
-def _facts(params: Params, jumped: tuple[Jumps, Jumps], different: Differences) -> SweepFacts:
+def _facts(
+    params: Params, jumped: tuple[Jumps, Jumps], cross_check: CrossCheck, baselines: tuple[BaselineCost, ...]
+) -> SweepFacts:
     before, after = (JumpCount(len(one.places), round(one.largest_mm, 6), round(one.largest_deg, 6)) for one in jumped)
     return SweepFacts(
         solver=params.solver,
@@ -249,48 +263,58 @@ def _facts(params: Params, jumped: tuple[Jumps, Jumps], different: Differences) 
         reference_strain=params.reference_strain_fraction,
         jumps_before=before,
         jumps_after=after,
-        cross_check=CrossCheck(
-            cells=len(different.shift_mm),
-            unsolved=different.unsolved,
-            agreeing=agreeing(different, params.translation_resolution_mm, params.rotation_resolution_deg),
-            shallower=shallower(different),
-            shift_mm=float(different.shift_mm.max(initial=0.0)),
-            rotation_deg=float(different.rotation_deg.max(initial=0.0)),
-            deeper_mm=float(different.deeper_mm.max(initial=0.0)),
-            shallower_mm=float((-different.deeper_mm).max(initial=0.0)),
+        cross_check=cross_check,
+        baselines=baselines,
+    )
+
+
+def _cross_check(
+    params: Params, found: Mapping[Place, Found], asked: Sequence[Recheck], answers: Sequence[StablePose]
+) -> CrossCheck:
+    different = differences(found, asked, answers)
+    compared = [one.attitude_deg for one, other in zip(asked, answers, strict=True) if other.status.usable]
+    return CrossCheck(
+        cells=len(different.shift_mm),
+        unsolved=different.unsolved,
+        agreeing=agreeing(different, params.translation_resolution_mm, params.rotation_resolution_deg),
+        shallower=shallower(different),
+        shift_mm=float(different.shift_mm.max(initial=0.0)),
+        rotation_deg=float(different.rotation_deg.max(initial=0.0)),
+        deeper_mm=float(different.deeper_mm.max(initial=0.0)),
+        shallower_mm=float((-different.deeper_mm).max(initial=0.0)),
+        attitudes=tuple(
+            CheckedAttitude(*attitude, round(float(shift), 6), round(float(turn), 6))
+            for attitude, shift, turn in zip(compared, different.shift_mm, different.rotation_deg, strict=True)
         ),
     )
 
 
-def _baselines(joint: Joint, anatomy: Anatomy, grid: Grid) -> Findings:
+def _baselines(joint: Joint, anatomy: Anatomy, grid: Grid) -> tuple[BaselineCost, ...]:
     """What motions that ignore the shape of the joint would cost on these bones."""
-    words = []
-    for name, baseline in (
-        ("a plain hinge about the flexion axis", hinge(grid.flexion_deg, anatomy.scan_attitude)),
-        ("Walker's published average motion", walker(grid.flexion_deg, anatomy.scan_attitude)),
-    ):
-        ways = np.array(joint.ways_to_contact(probes(baseline)))
-        overlap, gap = float(np.nanmax(-ways, initial=0.0)), float(np.nanmax(ways, initial=0.0))
-        words.append(f"{name} would overlap by up to {overlap:.1f} mm and gape by up to {gap:.1f} mm")
-    message = f"For comparison, on these bones and from the pose of the scan: {'; '.join(words)}."
-    return (Finding("N-SWP-04", Severity.NOTE, message),)
+    curves = [curve(grid.flexion_deg, anatomy.scan_attitude) for curve in (hinge, walker)]
+    return (_cost(joint, "hinge", curves[0]), _cost(joint, "walker", curves[1]))
+
+
+def _cost(joint: Joint, name: BaselineName, baseline: Baseline) -> BaselineCost:
+    asked = probes(baseline)
+    ways = zip(asked, joint.ways_to_contact(asked), strict=True)
+    met = [(one.flexion_deg, round(way, 6)) for one, way in ways if np.isfinite(way)]
+    return BaselineCost(name, tuple(flexion for flexion, _ in met), tuple(way for _, way in met))
 
 
 def _counts(ends: Sequence[int]) -> str:
     values, counts = np.unique(np.asarray(ends, dtype=np.uint8), return_counts=True)
-    return ", ".join(
-        f"{count} {Status(int(value)).name.lower().replace('_', ' ')}"
-        for value, count in zip(values, counts, strict=True)
-    )
+    return ", ".join(f"{Status(int(value)).words}: {count}" for value, count in zip(values, counts, strict=True))
 
 
 def _findings(table: RawTable, facts: SweepFacts) -> Findings:
     status = table.poses.status.ravel()
     counts = _counts(status.tolist())
-    found = [Finding("N-SWP-01", Severity.NOTE, f"{len(status)} attitudes: {counts}.")]
+    found = [Finding("N-SWP-01", Severity.NOTE, f"{len(status)} attitudes ({counts}).")]
     failed = int((status != Status.OK).sum())
     if failed:
-        message = f"{failed} of {len(status)} attitudes have no stable pose ({counts})."
+        why = _counts([end for end in status.tolist() if end != Status.OK])
+        message = f"{failed} of {len(status)} attitudes have no stable pose ({why})."
         found.append(Finding("W-SWP-01", Severity.REVIEW, message))
     if facts.jumps_before.count:
         message = (
@@ -304,11 +328,23 @@ def _findings(table: RawTable, facts: SweepFacts) -> Findings:
         message = (
             f"{check.cells} attitudes solved by the other solver too: {check.agreeing} agree within its resolutions; "
             f"largest difference {check.shift_mm:.2f} mm, {check.rotation_deg:.2f} deg. "
-            f"The table's pose is shallower in {check.shallower} (at most {check.shallower_mm:.3f} mm). "
-            f"In {check.unsolved} more the other solver found no pose."
+            f"The table's pose is shallower in {check.shallower} (at most {check.shallower_mm:.3f} mm)."
         )
+        if check.unsolved:
+            message += f" In {check.unsolved} more the other solver found no pose."
         found.append(Finding("N-SWP-03", Severity.NOTE, message))
+    if facts.baselines:
+        costs = "; ".join(_in_words(cost) for cost in facts.baselines)
+        message = f"For comparison, on these bones and from the pose of the scan: {costs}."
+        found.append(Finding("N-SWP-04", Severity.NOTE, message))
     return tuple(found)
+
+
+def _in_words(cost: BaselineCost) -> str:
+    titles = {"hinge": "a plain hinge about the flexion axis", "walker": "Walker's published average motion"}
+    gap = max((0.0, *cost.way_mm))
+    overlap = max((0.0, *(-way for way in cost.way_mm)))
+    return f"{titles[cost.name]} would overlap by up to {overlap:.1f} mm and gape by up to {gap:.1f} mm"
 
 
 STAGE = Stage(

@@ -66,6 +66,20 @@ def test_a_first_run_computes_all_and_a_second_nothing(job: CaseJob) -> None:
     assert [stage.findings for stage in second.stages] == [stage.findings for stage in first.stages]
 
 
+def test_a_stage_tells_how_long_its_parts_took_and_later_runs_know(job: CaseJob) -> None:
+    first, _ = run(job)
+    assert list(first.stages[1].parts) == ["multiplying"]
+    assert 0.004 <= first.stages[1].parts["multiplying"] <= first.stages[1].computing_s <= first.stages[1].seconds
+    assert first.stages[0].parts == {}
+    second, _ = run(job)
+    assert [(one.computing_s, one.parts) for one in second.stages] == [
+        (one.computing_s, one.parts) for one in first.stages
+    ]
+    record = load_record(job.results)
+    assert record is not None
+    assert record.outcome == second
+
+
 def test_the_results_lie_where_the_design_says(job: CaseJob) -> None:
     run(job)
     names = {path.relative_to(job.results).as_posix() for path in job.results.rglob("*") if path.is_file()}

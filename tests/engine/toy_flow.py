@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from pydantic import Field
 from pipeline.engine.artifacts import SOURCE, Files, folder
 from pipeline.engine.records import record_artifact
 from pipeline.engine.runner import CaseJob, Execution, RunOutcome, StageOutcome, run_case
-from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage, StrictParams, findings_of
+from pipeline.engine.stage import Finding, Findings, Inputs, Outputs, Severity, Stage, StrictParams, findings_of, timed
 from pipeline.errors import CaseRejected
 
 NUMBERS = record_artifact("numbers", "numbers.json", tuple[int, ...])
@@ -51,6 +52,9 @@ def multiply(reads: Inputs, params: MultiplyParams, out: Outputs) -> Findings:
     out[MULTIPLES] = multiples
     out[PARTS] = {f"{index}/value.txt": repr(value).encode() for index, value in enumerate(multiples[:2])}
     out.progress(len(multiples), len(multiples))
+    for _ in range(2):
+        with timed(out, "multiplying"):
+            time.sleep(0.002)
     large = [Finding("W-TOY-01", Severity.REVIEW, f"{value} is large") for value in multiples if value > 100]
     return (Finding("N-TOY-01", Severity.NOTE, "multiplied"), *large)
 

@@ -19,7 +19,7 @@ import pytest
 
 from pipeline.files.lut_content import LutFileContent
 from pipeline.files.lut_file import decode_lut, encode_lut
-from pipeline.files.lut_schema import DATASETS, FLAGS, SCALES, arrays_of, root_attributes
+from pipeline.files.lut_schema import DATASETS, FLAGS, MINOR, SCALES, arrays_of, links, root_attributes
 from pipeline.kinematics.table import Grid, Status
 from tests.files.lut_sample import content
 
@@ -119,14 +119,10 @@ def test_every_dataset_says_what_it_is_and_is_checksummed(good: bytes) -> None:
     with h5py.File(io.BytesIO(good)) as file:
         found: list[str] = []
         file.visit(found.append)
-        assert {f"/{name}" for name in found if isinstance(file[name], h5py.Dataset)} <= {
-            *(spec.path for spec in DATASETS),
-            *(
-                f"/{group}{axis}"
-                for group in ("", "lut/", "raw/", "smoothing/")
-                for axis in ("flexion_deg", "varus_deg")
-            ),
-        }
+        # a dataset with several links is visited once, by one of them
+        visited = {f"/{name}" for name in found if isinstance(file[name], h5py.Dataset)}
+        assert visited <= {spec.path for spec in DATASETS} | set(links(MINOR))
+        assert len(visited) == len(DATASETS)
         for spec in DATASETS:
             dataset = file[spec.path]
             assert dataset.fletcher32, spec.path
@@ -139,7 +135,7 @@ def test_every_dataset_says_what_it_is_and_is_checksummed(good: bytes) -> None:
 def test_the_names_of_the_status_are_its_values(good: bytes) -> None:
     assert tuple(status.name.lower() for status in Status) == FLAGS
     with h5py.File(io.BytesIO(good)) as file:
-        for group in ("lut", "raw"):
+        for group in ("lut", "raw", "neutral"):
             attributes = file[f"{group}/status"].attrs
             assert tuple(attributes["flags"]) == tuple(attributes["flag_meanings"].split()) == FLAGS
             np.testing.assert_array_equal(attributes["flag_values"], list(Status))
@@ -160,30 +156,45 @@ def test_what_is_unusable_is_nan(good: bytes) -> None:
 def test_the_neutral_curve_runs_along_the_flexion_of_the_grid(good: bytes) -> None:
     expected = content(bad=BAD).neutral
     with h5py.File(io.BytesIO(good)) as file:
-        assert set(file["neutral"]) == {field.name for field in fields(expected)} - {"flexion_deg"}
-        for name, dataset in file["neutral"].items():
-            assert dataset.dims[0].values() == [file["grid/flexion_deg"]], name
-            np.testing.assert_array_equal(dataset, getattr(expected, name))
+        assert set(file["neutral"]) == {field.name for field in fields(expected)} | {"neutral_varus_deg"}
+        assert file["neutral/flexion_deg"] == file["grid/flexion_deg"]
+        assert file["neutral/neutral_varus_deg"] == file["neutral/varus_deg"]
+        for field in fields(expected)[1:]:
+            dataset = file["neutral"][field.name]
+            assert dataset.dims[0].values() == [file["grid/flexion_deg"]], field.name
+            np.testing.assert_array_equal(dataset, getattr(expected, field.name))
         assert np.isnan(file["neutral/varus_deg"][-1])
         assert file["neutral/status"][-1] == Status.NO_CONTACT
 
 
-@pytest.mark.parametrize("group", ["/", "lut", "raw", "grid"])
-def test_xarray_names_the_coordinates(tmp_path: Path, good: bytes, group: str) -> None:
-    xarray = pytest.importorskip("xarray")
-    pytest.importorskip("h5netcdf")
-    path = tmp_path / "lut.h5"
-    path.write_bytes(good)
-    grid = content().smooth.grid
-    with xarray.open_dataset(path, group=group, engine="h5netcdf") as data:
-        np.testing.assert_array_equal(data.flexion_deg, grid.flexion_deg)
-        np.testing.assert_array_equal(data.varus_deg, grid.varus_deg)
-        assert data.flexion_deg.attrs["units"] == "degree"
-        if group in ("lut", "raw"):
-            assert data.lateral_mm.dims == ("flexion_deg", "varus_deg")
-            assert data.moved_from_scan.dims == ("flexion_deg", "varus_deg", "row", "column")
-            expected = content().smooth.poses.lateral_mm[7, 2]
-            assert data.lateral_mm.sel(flexion_deg=35, varus_deg=0).item() == expected
+def as_version_1_0(data: bytes) -> bytes:
+    """The file as the first version had it: without what was added later."""
+
+    def older(file: Any) -> None:
+        file.attrs["version"] = "1.0"
+        for path in sorted({*links(MINOR)} - {*links(0)}):
+            del file[path]
+        for spec in DATASETS:
+            if spec.since:
+                del file[spec.path]
+
+    return changed(data, older)
+
+
+def test_a_table_of_version_1_0_is_read(good: bytes) -> None:
+    older = as_version_1_0(good)
+    with h5py.File(io.BytesIO(older)) as file:
+        assert "xyz" not in file
+        assert sorted(file["lut"])[-1] == "varus_deg"
+    assert_equal(decode_lut(older), content(bad=BAD))
+    with pytest.raises(ValueError, match="/smoothing/midpoint_error_mm: expected 12 flexion intervals"):
+        decode_lut(changed(older, _remake("smoothing/midpoint_error_mm", data=np.zeros((13, 4)))))
+
+
+def test_a_table_of_version_1_0_holds_nothing_of_later_versions(good: bytes) -> None:
+    data = changed(good, lambda file: file.attrs.__setitem__("version", "1.0"))
+    with pytest.raises(ValueError, match="/: unknown member 'corner'"):
+        decode_lut(data)
 
 
 BREAKS: dict[str, tuple[Callable[[LutFileContent], LutFileContent], str]] = {
@@ -204,7 +215,34 @@ BREAKS: dict[str, tuple[Callable[[LutFileContent], LutFileContent], str]] = {
     ),
     "shape": (lambda c: _poses(c, medial_gap_mm=np.zeros((2, 2))), "lut medial_gap_mm: expected shape"),
     "status": (lambda c: _poses(c, status=c.smooth.poses.status + np.uint8(6)), "lut status: expected 0 to 5, got 6"),
-    "usable nan": (lambda c: _poses(c, lateral_mm=c.smooth.poses.lateral_mm * np.nan), "not a finite number"),
+    "usable nan": (
+        lambda c: _poses(c, lateral_mm=c.smooth.poses.lateral_mm * np.nan),
+        "lut: a usable entry has a coor",
+    ),
+    "pose where there is none": (
+        lambda c: _poses(c, status=c.smooth.poses.status + np.uint8(2)),
+        "lut: an entry that is not usable has a coordinate",
+    ),
+    "neutral shape": (
+        lambda c: _neutral(c, uneven_mm=np.zeros(3)),
+        r"neutral uneven_mm: expected shape \(13,\) of the grid, got \(3,\)",
+    ),
+    "neutral flexion": (
+        lambda c: _neutral(c, flexion_deg=c.neutral.flexion_deg + 1.0),
+        "neutral flexion_deg: expected the flexion of the grid",
+    ),
+    "neutral status": (
+        lambda c: _neutral(c, status=c.neutral.status + np.uint8(6)),
+        "neutral status: expected 0 to 5, got 10",
+    ),
+    "neutral nan": (
+        lambda c: _neutral(c, varus_deg=c.neutral.varus_deg * np.nan),
+        "neutral: a usable entry has a coor",
+    ),
+    "neutral pose where there is none": (
+        lambda c: _neutral(c, proximal_mm=np.zeros(13)),
+        "neutral: an entry that is not usable has a coordinate",
+    ),
     "type": (
         lambda c: _poses(c, medial_gap_mm=c.smooth.poses.medial_gap_mm.astype(np.float32)),
         "/lut/medial_gap_mm: expected float64, got float32",
@@ -214,6 +252,10 @@ BREAKS: dict[str, tuple[Callable[[LutFileContent], LutFileContent], str]] = {
 
 def _body(c: LutFileContent, **parts: Any) -> LutFileContent:
     return replace(c, moving_body=replace(c.moving_body, **parts))
+
+
+def _neutral(c: LutFileContent, **arrays: Any) -> LutFileContent:
+    return replace(c, neutral=replace(c.neutral, **arrays))
 
 
 def _grid(c: LutFileContent, flexion: Any) -> LutFileContent:
@@ -253,6 +295,11 @@ def _virtual(file: Any) -> None:
     layout = h5py.VirtualLayout((3,), "f8")
     layout[:] = h5py.VirtualSource("elsewhere.h5", "secret", shape=(3,))
     file.create_virtual_dataset("frames/delta", layout)
+
+
+def _with_a_midpoint_more(file: Any) -> None:
+    _remake("smoothing/midpoint_error_mm", data=np.zeros((13, 4)))(file)
+    _remake("smoothing/flexion_midpoint_deg", data=np.zeros(13))(file)
 
 
 def _unsealed(name: str, text: str) -> Callable[[Any], None]:
@@ -301,8 +348,25 @@ FOREIGN: dict[str, tuple[Callable[[Any], object], str]] = {
         _remake("neutral/varus_deg", data=np.zeros(12)),
         "/neutral/varus_deg: expected 13 values along flexion_deg, got 12",
     ),
-    "intervals": (_remake("smoothing/midpoint_error_mm", data=np.zeros((13, 4))), "expected 12 flexion intervals"),
+    "intervals": (_with_a_midpoint_more, "expected 12 flexion intervals"),
     "edited table": (lambda f: f["lut/lateral_mm"].__setitem__((0, 0), 9.0), "/lut/moved_from_scan: does not follow"),
+    "edited neutral curve": (
+        lambda f: f["neutral/status"].__setitem__(0, 4),
+        "neutral: an entry that is not usable has a coordinate",
+    ),
+    "edited scale": (
+        lambda f: f["frames/coordinate"].__setitem__(0, 5),
+        "/frames/coordinate: does not number the values along coordinate",
+    ),
+    "edited midpoints": (
+        lambda f: f["smoothing/flexion_midpoint_deg"].__setitem__(0, 0.0),
+        "/smoothing/flexion_midpoint_deg: does not number",
+    ),
+    "scale of another size": (
+        _remake("smoothing/curve", data=np.arange(3, dtype="i4")),
+        "/smoothing/curve: expected 2 values along curve, got 3",
+    ),
+    "scale elsewhere": (_swap("xyz", h5py.ExternalLink("elsewhere.h5", "/xyz")), "/xyz: expected a member"),
     "edited motion": (
         lambda f: f["raw/moved_from_scan"].__setitem__((1, 1, 0, 3), 9.0),
         "/raw/moved_from_scan: does not follow",
@@ -382,14 +446,15 @@ def test_the_examples_of_the_format_page_run(tmp_path: Path, monkeypatch: pytest
     monkeypatch.chdir(tmp_path)
     Path("lut.h5").write_bytes(good)
     examples = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    assert len(examples) == 3
+    assert len(examples) == 4
     names: dict[str, Any] = {}
     for example in examples:
         exec(compile(example, PAGE.name, "exec"), names)
-    names["lut"] = names["xarray"] = None  # closes what the reader left open
+    names["lut"] = names["frames"] = names["xarray"] = None  # closes what the reader left open
     assert names["placed"].shape == names["points"].shape
     assert names["clip"].shape == (61, 4, 4)
     assert names["six"].flexion_deg == 60.0
+    assert names["scan_pose"]["proximal_mm"] == 2.0
 
 
 def test_content_has_no_field_that_the_file_forgets() -> None:

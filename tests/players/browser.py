@@ -28,6 +28,8 @@ FLAGS = (
 SOFTWARE_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 NO_WEBGL = ("--disable-3d-apis",)
 SECONDS = 60.0
+#: Until what was changed is drawn.
+NEXT_FRAME = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))"
 
 
 class Browser:
@@ -118,6 +120,11 @@ class Browser:
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
+
+    def choose(self, selector: str, file: Path) -> None:
+        """Give a file to the field of a page, as a person does who picks it."""
+        field = self.call("Runtime.evaluate", expression=f"document.querySelector({json.dumps(selector)})")["result"]
+        self.call("DOM.setFileInputFiles", files=[str(file)], objectId=field["objectId"])
 
     def screenshot(self) -> bytes:
         """PNG of what is seen."""

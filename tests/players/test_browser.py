@@ -21,14 +21,13 @@ from pipeline.report.build import Page, report_html
 from pipeline.report.evidence import Evidence
 from pipeline.report.settings import PictureSettings
 from pipeline.report.verdict import judge
-from tests.players.browser import CHROMIUM, NO_WEBGL, SOFTWARE_WEBGL, Browser
+from tests.players.browser import CHROMIUM, NEXT_FRAME, NO_WEBGL, SOFTWARE_WEBGL, Browser
 from tests.report.sample import frame_of, only_one_attitude, revolved, sample_evidence, with_status
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: the report is tried in no browser")
 
 #: A plateau with vertices all over, so that its colours can tell where it is touched.
 PLATEAU = revolved([(-100.0, 12.0), (-35.0, 30.0), *((-20.0 - 1e-3 * r, r) for r in range(33, 0, -2))])
-NEXT_FRAME = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))"
 
 
 def evidence() -> Evidence:
@@ -49,7 +48,6 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     """One browser that draws WebGL, with the page of the sample."""
     with Browser(tmp_path_factory.mktemp("profile"), *SOFTWARE_WEBGL) as one:
         one.open(written(tmp_path_factory.mktemp("page"), evidence()))
-        one.run("document.querySelector('.viewer canvas').scrollIntoView()")
         yield one
 
 
@@ -62,6 +60,7 @@ def _at_rest(request: pytest.FixtureRequest) -> None:
             one.run(f"document.querySelector('input[name={name}]').checked = {str(on).lower()}")
         put(one, flexion=0, varus=0)
         one.run("document.querySelector('button[data-azimuth=\"90\"]').click()")
+        one.run("document.querySelector('.viewer canvas').scrollIntoView()")
 
 
 def put(browser: Browser, **values: float) -> None:
@@ -121,6 +120,43 @@ def test_keys_move_the_sliders(browser: Browser) -> None:
     for kind in ("keyDown", "keyUp"):
         browser.call("Input.dispatchKeyEvent", type=kind, key="ArrowRight", code="ArrowRight", windowsVirtualKeyCode=39)
     assert text(browser, "output[name=flexion]") == "1.0°"
+
+
+def test_plus_and_minus_zoom_and_the_page_says_so(browser: Browser) -> None:
+    canvas = "document.querySelector('.viewer canvas')"
+    browser.run(f"{canvas}.focus()")
+    drawn = [pixels(browser)]
+    for key in "+-":
+        browser.call("Input.dispatchKeyEvent", type="keyDown", key=key, text=key)
+        browser.call("Input.dispatchKeyEvent", type="keyUp", key=key)
+        browser.run(NEXT_FRAME)
+        drawn.append(pixels(browser))
+    assert (drawn[1] != drawn[0]).any(axis=-1).mean() > 0.01
+    np.testing.assert_array_equal(drawn[2], drawn[0])
+    assert browser.run(f"{canvas}.getAttribute('aria-label')").endswith("arrow keys turn it, + and - zoom")
+
+
+def test_every_control_is_reached_by_the_tab_key_and_has_a_name(browser: Browser) -> None:
+    controls = (
+        "[...document.querySelectorAll('.viewer :is(canvas, input, button), #sign-off :is(input, textarea, button)')]"
+    )
+    shown = f"{controls}.filter(one => one.checkVisibility())"
+    browser.run(f"{shown}.forEach((one, k) => {{ one.id = 'control' + k }}); {shown}[0].focus()")
+    reached = [browser.run("document.activeElement.id")]
+    for _ in range(40):
+        for kind in ("keyDown", "keyUp"):
+            browser.call("Input.dispatchKeyEvent", type=kind, key="Tab", code="Tab", windowsVirtualKeyCode=9)
+        reached.append(browser.run("document.activeElement.id"))
+    # of the three decisions, which are one control, the tab key reaches one; a date has several fields of its own
+    count = browser.run(f"{shown}.length")
+    assert {f"control{k}" for k in range(count)} - set(reached) <= {
+        browser.run(f"{shown}.filter(one => one.type === 'radio')[{k}].id") for k in range(3)
+    }
+    tree = browser.call("Accessibility.getFullAXTree")["nodes"]
+    named = {"button", "slider", "checkbox", "radio", "textbox", "img", "Date"}
+    nodes = [one for one in tree if not one["ignored"] and one["role"]["value"] in named]
+    assert len(nodes) >= count
+    assert [one for one in nodes if not one["name"]["value"].strip()] == []
 
 
 def test_an_attitude_without_a_pose_is_said_and_grey(browser: Browser) -> None:

@@ -47,6 +47,7 @@ class MemoryOutputs:
         self.jobs = jobs
         self.files: dict[str, Mapping[str, bytes]] = {}
         self.steps: list[tuple[int, int]] = []
+        self.parts: list[str] = []
 
     def __setitem__(self, artifact: Artifact[T], value: T) -> None:
         self.files[artifact.name] = artifact.encode(value)
@@ -58,6 +59,10 @@ class MemoryOutputs:
     def progress(self, done: int, total: int) -> None:
         """Remember how far the stage says it is."""
         self.steps.append((done, total))
+
+    def took(self, part: str, seconds: float) -> None:
+        """Remember the parts."""
+        self.parts.append(part)
 
 
 def reads_of(evidence: Evidence) -> MemoryReads:

@@ -19,7 +19,9 @@ from pipeline.kinematics.table import CurveFit, Grid, PoseTable, RawTable, Smoot
 from pipeline.records import (
     Anatomy,
     AxisEstimate,
+    BaselineCost,
     CaseFacts,
+    CheckedAttitude,
     CrossCheck,
     JumpCount,
     Landmark,
@@ -52,6 +54,11 @@ SWEEP = SweepFacts(
         rotation_deg=0.7,
         deeper_mm=0.05,
         shallower_mm=0.02,
+        attitudes=(CheckedAttitude(20.0, 0.0, 0.3, 0.2), CheckedAttitude(70.0, -4.0, 0.1, 0.7)),
+    ),
+    baselines=(
+        BaselineCost("hinge", (0.0, 60.0, 120.0), (0.0, -1.25, 0.5)),
+        BaselineCost("walker", (0.0, 60.0), (0.0, -4.0)),
     ),
 )
 STAGES = ("intake", "segment", "mesh", "anatomy", "contact", "sweep", "smooth")

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from pipeline.adapters import plotting
-from pipeline.comparison import compare
+from pipeline.commands.two_tables import compare_cases, comparison_lines
 from pipeline.errors import CaseRejected, ConfigError, ExitCode, PipelineError
 from pipeline.files.lut_content import LutFileContent
 from pipeline.files.lut_file import encode_lut
+from pipeline.kinematics.comparison import compare
 from pipeline.kinematics.table import Grid
 from pipeline.report import comparison_page
 from pipeline.report.comparison_page import ComparedTable, ComparisonPage, comparison_html
-from pipeline.two_tables import compare_cases, comparison_lines
 from tests.files.lut_sample import GRID, content
 
 HOSTILE = '"><script>alert(1)</script>{{ 7 * 7 }}$x$'

@@ -57,7 +57,7 @@ def test_a_failed_metric_says_number_and_limit_in_a_sentence() -> None:
     assert finding.code == "W-QA-05"
     assert finding.severity is Severity.REVIEW
     assert finding.message == (
-        "An entry of the table leaves a gap or an overlap: title of contact_error 0.03123 mm, expected at most 0.02 mm."
+        "An entry of the table leaves a gap or an overlap: 0.03123 mm, expected at most 0.02 mm."
     )
 
 

@@ -129,10 +129,21 @@ def test_the_data_are_json_without_surprises_and_the_same_every_time() -> None:
         assert json.loads(text)["notice"] == "Research use - not for diagnosis"
 
 
+def test_no_two_files_of_the_script_give_a_name_twice() -> None:
+    """They share one scope, where a second `const` or `class` of a name would stop all of them."""
+    names = re.findall(
+        r"^(?:export )?(?:const|let|class|(?:async )?function) +([A-Za-z_$][\w$]*)", scripts()[1], re.MULTILINE
+    )
+    assert {"Lut", "Nearness", "Ghost", "Viewer", "listenToSignOff"} <= set(names)
+    assert sorted(names) == sorted(set(names))
+
+
 def test_the_policy_names_the_scripts_by_hash_and_nothing_more() -> None:
     digest = base64.b64encode(hashlib.sha256(b"one()").digest()).decode()
     policy = content_policy(["one()"])
-    assert policy == f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
+    nothing = "default-src 'none'; base-uri 'none'; form-action 'none'"
+    strict = f"{nothing}; img-src data:; style-src 'unsafe-inline'; media-src data:"
+    assert policy == f"{strict}; script-src 'sha256-{digest}'"
 
 
 def test_the_scripts_cannot_end_their_element_nor_make_code_from_text_nor_load() -> None:

@@ -59,6 +59,9 @@ class Run:
     def progress(self, done: int, total: int) -> None:
         self.told.append((done, total))
 
+    def took(self, part: str, seconds: float) -> None:
+        """Nobody asks how long it took."""
+
     def go(self, params: StrictParams) -> Findings:
         """Run the stage."""
         return self.stage.run(self, params, self)

@@ -71,6 +71,9 @@ class CaseOutputs:
     def progress(self, done: int, total: int) -> None:
         self.progressed.append((done, total))
 
+    def took(self, part: str, seconds: float) -> None:
+        """Nobody asks how long it took."""
+
     def decoded(self, artifact: Artifact[T]) -> T:
         return artifact.decode(self.files[artifact.name])
 

@@ -71,6 +71,9 @@ class Out:
     def progress(self, done: int, total: int) -> None:
         """Nobody watches."""
 
+    def took(self, part: str, seconds: float) -> None:
+        """Nobody asks how long it took."""
+
 
 def reads(side: Side = "right") -> Reads:
     table = content(side)

@@ -22,8 +22,8 @@ from pipeline.geometry.phantom import PHANTOM_LABELS, phantom_labels
 from pipeline.geometry.phantom_spec import PhantomSpec
 from pipeline.geometry.synthetic_ct import SyntheticCtSpec, synthetic_ct
 from pipeline.geometry.volume import CtVolume, LabelVolume, cropped
+from pipeline.labels.site import SiteCommand
 from pipeline.records import Side
-from pipeline.site_labels import SiteCommand
 from pipeline.stages.segment import STAGE, Params
 from tests import fake_segmenter
 from tests.stages.in_memory import Run, facts

@@ -142,11 +142,12 @@ def test_progress_counts_cells_and_those_of_the_way_back_up_to_all_of_them(swept
 
 def test_a_full_table_without_jumps_is_only_noted(swept: tuple[Run, Findings]) -> None:
     run, findings = swept
-    assert [(one.code, one.message) for one in findings] == [("N-SWP-01", "6 attitudes: 6 ok.")]
+    assert [(one.code, one.message) for one in findings] == [("N-SWP-01", "6 attitudes (stable pose found: 6).")]
     facts = run[SWEEP_FACTS]
     assert facts.jumps_before.count == facts.jumps_after.count == 0
     assert 0.0 < facts.jumps_after.largest_mm < 2.0 * PLACE_MM
     assert facts.cross_check == CrossCheck(0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0)
+    assert facts.baselines == ()
 
 
 def test_the_solvers_are_compared_where_that_is_asked_for(checked: tuple[Run, Findings]) -> None:
@@ -160,6 +161,29 @@ def test_the_solvers_are_compared_where_that_is_asked_for(checked: tuple[Run, Fi
     (said,) = [one for one in checked[1] if one.code == "N-SWP-03"]
     assert said.severity is Severity.NOTE
     assert said.message.startswith(f"6 attitudes solved by the other solver too: {check.agreeing} agree ")
+
+
+def test_each_attitude_that_both_solvers_solved_is_kept(checked: tuple[Run, Findings]) -> None:
+    check = checked[0][SWEEP_FACTS].cross_check
+    places = [(one.flexion_deg, one.varus_deg) for one in check.attitudes]
+    assert places == [(flexion, varus) for flexion in (0.0, 10.0) for varus in (0.0, 1.0, 2.0)]
+    assert max(one.shift_mm for one in check.attitudes) == pytest.approx(check.shift_mm, abs=1e-6)
+    assert max(one.rotation_deg for one in check.attitudes) == pytest.approx(check.rotation_deg, abs=1e-6)
+
+
+def test_baselines_keep_their_way_to_contact_at_each_flexion() -> None:
+    run, findings = swept_with(baselines=True)
+    hinge, walker = run[SWEEP_FACTS].baselines
+    assert [(one.name, one.flexion_deg) for one in (hinge, walker)] == [("hinge", (0.0, 10.0)), ("walker", (0.0, 10.0))]
+    # the scan lies beside the place of rest and before it: the way is that of a ball in a bowl, at every flexion
+    way = np.sqrt(REST_MM**2 - 0.4**2 - 0.2**2) - 5.5
+    np.testing.assert_allclose(hinge.way_mm, way, rtol=0, atol=2.0 * FACETS_MM)
+    assert walker.way_mm[0] > hinge.way_mm[0] + 0.2
+    (said,) = [one for one in findings if one.code == "N-SWP-04"]
+    assert (
+        f"a plain hinge about the flexion axis would overlap by up to 0.0 mm and gape by up to {way:.1f} mm;"
+        in said.message
+    )
 
 
 @pytest.mark.parametrize(("fraction", "cells"), [(0.5, 3), (0.2, 1), (0.05, 0)])
@@ -218,7 +242,7 @@ def test_two_jobs_give_the_same_bytes(checked: tuple[Run, Findings]) -> None:
 def test_a_joint_without_any_stable_pose_is_refused(solver: str) -> None:
     """A ball that starts 200 mm beside the joint meets nothing."""
     run = Run(STAGE, inputs(shifted(ball(), x=200.0)))
-    with pytest.raises(CaseRejected, match=r"E-SWP-01 No stable pose at any of 2 flexions .*: 2 no contact"):
+    with pytest.raises(CaseRejected, match=r"E-SWP-01 No stable pose at any of 2 flexions .*no contact: 2"):
         run.go(Params(**{**SMALL, "solver": solver}))
     assert run.left == {}
 
@@ -226,7 +250,7 @@ def test_a_joint_without_any_stable_pose_is_refused(solver: str) -> None:
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_bounds_are_about_the_scan(solver: str) -> None:
     """The place of rest is 0.45 mm beside the scan."""
-    with pytest.raises(CaseRejected, match=r"E-SWP-01 .* 2 slid off"):
+    with pytest.raises(CaseRejected, match=r"E-SWP-01 .* \(slid off: 2"):
         swept_with(solver=solver, slide_bound_mm=0.2)
     swept_with(solver=solver, slide_bound_mm=0.45 + PLACE_MM)
 
@@ -304,7 +328,7 @@ def test_attitudes_that_failed_ask_for_review() -> None:
     np.testing.assert_array_equal(status[1], Status.SLID_OFF)
     np.testing.assert_array_equal(np.isnan(run[RAW_TABLE].poses.proximal_mm), status != Status.OK)
     assert [one.severity for one in findings] == [Severity.NOTE, Severity.REVIEW]
-    assert findings[1].message == "3 of 6 attitudes have no stable pose (3 ok, 3 slid off)."
+    assert findings[1].message == "3 of 6 attitudes have no stable pose (slid off: 3)."
 
 
 # --- ligaments

@@ -1,6 +1,6 @@
 /**
- * The joint of the report, to be moved by sliders. Stands after player.js and contact.js in one script of the page, and
- * after the bundle that defines THREE; reads the JSON of the element `viewer-data`, which `figure_viewer.py` writes.
+ * The joint of the report, to be moved by sliders. Stands last of the files of one script of the page, and after the
+ * bundle that defines THREE; reads the JSON of the element `viewer-data`, which `figure_viewer.py` writes.
  *
  * The scene is drawn out of sight and copied to the canvas of the page together with case, side, attitude and notice,
  * so that a picture saved from the page carries them.
@@ -12,6 +12,7 @@ const ZOOM_STEP = 1.2;
 const CLEAR = 0.28;
 const FAINT = 0.1;
 const UNPOSED = 0x9b9b9b;
+const FAR = 0xf3efe6; // beyond the colours of contact: no colour that one of them could be taken for
 const BACKGROUND = 0xffffff;
 const FONT = '"Segoe UI", Roboto, "Helvetica Neue", Arial, "Liberation Sans", sans-serif';
 
@@ -70,7 +71,7 @@ class Knee {
     if (look === this.look && look !== "contact") return;
     this.look = look;
     for (const { mesh, color } of this.parts.filter((part) => part.body === "moving")) {
-      paint(mesh, new THREE.Color(posed ? color : UNPOSED));
+      paint(mesh, new THREE.Color(!posed ? UNPOSED : contact ? FAR : color));
       if (look === "contact") this._paintContact(mesh, motion);
     }
   }
@@ -204,7 +205,7 @@ class Viewer {
   }
 
   _listen() {
-    for (const input of this.root.querySelectorAll("input")) {
+    for (const input of this.root.querySelectorAll("input:not([type=file])")) {
       input.addEventListener("input", () => {
         if (input === this.flexion) this._stop();
         this._update();
@@ -220,8 +221,59 @@ class Viewer {
       button.addEventListener("click", () => this._zoom(Number(button.dataset.zoom)));
     }
     this.one("button.play").addEventListener("click", () => (this.playing ? this._stop() : this._play()));
+    this._listenToGhost();
     this._listenToCanvas();
     new ResizeObserver(() => this.draw()).observe(this.canvas);
+  }
+
+  _listenToGhost() {
+    const file = this.one("input[type=file]");
+    file.addEventListener("click", () => { file.value = ""; }); // so that the same file can be chosen again
+    file.addEventListener("change", () => file.files.length && this._compare(file.files[0]));
+    this.one("button.remove").addEventListener("click", () => {
+      file.value = "";
+      this._haunt(null);
+      file.focus();
+    });
+  }
+
+  /** Show the joint of another report, or say why not. */
+  async _compare(file) {
+    let [ghost, problem] = [null, ""];
+    try {
+      ghost = new Ghost(await reportIn(file), this.page);
+    } catch (error) {
+      if (!(error instanceof Unfit || error instanceof DOMException)) throw error;
+      problem = error instanceof Unfit ? error.message : "The browser cannot read this file.";
+    }
+    this._haunt(ghost, problem);
+  }
+
+  /** Take the ghost that is there away and put another in its place, if any. */
+  _haunt(ghost, problem = "") {
+    this.ghost?.dispose();
+    this.ghost = ghost;
+    if (ghost) this.knee.scene.add(ghost.group);
+    this.one("input[name=ghost]").checked = true;
+    this.one(".haunted").hidden = !ghost;
+    this.one(".ghost-problem").textContent = problem;
+    this.one(".ghost-who").textContent = ghost ? this._whose(ghost) : "";
+    this._update();
+  }
+
+  _whose(ghost) {
+    const here = `${this.page.heading}, in its own colours.`;
+    return `${ghost.words}${ghost.mirrored ? ` to lie over this ${this.page.lut.side} one` : ""}. This one: ${here}`;
+  }
+
+  /** Move the ghost by its own table, and say how it differs here. */
+  _placeGhost(flexion, varus) {
+    const there = this.ghost.place(flexion, varus);
+    this.ghost.group.visible = this.one("input[name=ghost]").checked;
+    const none = "has no stable pose at this attitude";
+    if (!this.ghost.moving.visible) return `The other ${none}, so its lower bone is not shown; it covers ${this.ghost.range}.`;
+    if (!this.posed) return `This one ${none}, so there is nothing to compare.`;
+    return differenceWords(this.lut.coordinates(flexion, varus, "nan"), there);
   }
 
   _listenToCanvas() {
@@ -231,6 +283,7 @@ class Viewer {
       if (canvas.hasPointerCapture(event.pointerId)) this._drag(event.movementX, event.movementY);
     });
     canvas.addEventListener("keydown", (event) => {
+      if ("+-".includes(event.key)) this._zoom(event.key === "+" ? 1 : -1);
       const way = { ArrowLeft: [-20, 0], ArrowRight: [20, 0], ArrowUp: [0, -20], ArrowDown: [0, 20] }[event.key];
       if (!way) return;
       event.preventDefault();
@@ -299,6 +352,7 @@ class Viewer {
       this.knee.moving.visible = false; // no entry of the table can be shown
     }
     this.knee.show({ axes, clear, contact });
+    if (this.ghost) this.one(".ghost-difference").textContent = this._placeGhost(flexion, varus);
     this.draw();
   }
 
@@ -340,11 +394,12 @@ class Viewer {
     this._tag(pen, page.heading, [12, 20], { size: 17, bold: true });
     this._tag(pen, this.attitude, [12, 44], { size: 16 });
     this._tag(pen, page.notice, [width - 12, height - 16], { size: 14, bold: true, align: "right" });
+    const narrow = width < 700; // there the marks stand clear of heading and notice
     const edges = [
       [eye.right, [width - 12, height / 2], "right"],
       [eye.right.clone().negate(), [12, height / 2], "left"],
-      [eye.up, [width / 2, width < 700 ? 94 : 16], "center"], // on a narrow page below the heading
-      [eye.up.clone().negate(), [width / 2, height - 16], "center"],
+      [eye.up, [width / 2, narrow ? 94 : 16], "center"],
+      [eye.up.clone().negate(), [width / 2, height - (narrow ? 68 : 16)], "center"],
     ];
     for (const [direction, at, align] of edges) this._tag(pen, eye.word(direction), at, { align, color: "#5d5d5d" });
     if (this.one("input[name=axes]").checked) {
@@ -354,6 +409,10 @@ class Viewer {
       }
     }
     if (this.said) this._tag(pen, this.said, [12, 70], { size: 15, bold: true, color: "#b34700" });
+    if (this.ghost?.group.visible) {
+      const color = `#${GHOST_COLOR.toString(16)}`;
+      this._tag(pen, this.ghost.words, [12, height - (width < 900 ? 42 : 16)], { size: 15, bold: true, color });
+    }
   }
 
   _tag(pen, words, [x, y], { size = 14, bold = false, align = "left", color = "#1c1c1c" }) {

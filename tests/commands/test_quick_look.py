@@ -11,6 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.commands.preflight import Row, State
+from pipeline.commands.quick_look import examine
+from pipeline.commands.request import Request
 from pipeline.engine.outcome import Execution, RunOutcome
 from pipeline.engine.runner import run_case
 from pipeline.errors import CaseRejected
@@ -21,15 +24,12 @@ from pipeline.geometry.phantom import PHANTOM_LABELS, phantom_labels
 from pipeline.geometry.phantom_spec import PhantomSpec
 from pipeline.geometry.synthetic_ct import SyntheticCtSpec, synthetic_ct
 from pipeline.geometry.volume import CtVolume, LabelVolume, centroid_lps, in_lps_order
-from pipeline.preflight import Row, State
-from pipeline.quick_look import examine
-from pipeline.request import Request
 from tests.end_to_end.knee_runs import Silent, up_to
 from tests.files.dicom_samples import with_positions
 
 Files = Mapping[str, bytes]
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 BONES = {name: PHANTOM_LABELS[name] for name in ("femur", "tibia", "patella", "fibula")}
 KNEE = PhantomSpec(shaft_length_mm=20.0, spacing_mm=(1.5, 1.5, 1.5), grid_tilt_deg=(0.0, 0.0, 0.0))
 SCAN = SyntheticCtSpec(spacing_mm=(1.5, 1.5, 1.5))

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.case_id import is_case_id
-from pipeline.comparison import compare
 from pipeline.errors import CaseRejected, ConfigError
 from pipeline.files.lut_file import decode_lut
+from pipeline.kinematics.comparison import compare
 from pipeline.suggestions import shown
 
 if TYPE_CHECKING:

@@ -8,11 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.engine.stage import Finding, Severity
-from pipeline.errors import CaseRejected, ExitCode
-from pipeline.geometry.field_of_view import BoneExtent, KneeExtent
-from pipeline.geometry.knee_side import SideSign
-from pipeline.preflight import (
+from pipeline.commands.preflight import (
     Row,
     SeriesFacts,
     State,
@@ -29,6 +25,10 @@ from pipeline.preflight import (
     structures_rows,
     volume_row,
 )
+from pipeline.engine.stage import Finding, Severity
+from pipeline.errors import CaseRejected, ExitCode
+from pipeline.geometry.field_of_view import BoneExtent, KneeExtent
+from pipeline.geometry.knee_side import SideSign
 
 MATRIX = np.diag([0.5, 0.5, 0.8, 1.0])
 SERIES = SeriesFacts(300, (), ("",), 1.0, 0.0, MATRIX)

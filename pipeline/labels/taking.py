@@ -13,7 +13,7 @@ from pipeline.errors import CaseRejected
 from pipeline.geometry.label_cleaning import LabelRepair, clean_label
 from pipeline.geometry.two_legs import one_leg
 from pipeline.geometry.volume import LabelVolume, border_areas_mm2, box_of, cropped
-from pipeline.label_review import (
+from pipeline.labels.review import (
     is_soft,
     review_anisotropy,
     review_clipping,
@@ -21,7 +21,7 @@ from pipeline.label_review import (
     review_pieces,
     review_touching,
 )
-from pipeline.label_scheme import MARGIN_VOXELS
+from pipeline.labels.scheme import MARGIN_VOXELS
 from pipeline.records import CaseFacts
 
 #: What is told how much of the work is done: done, total.

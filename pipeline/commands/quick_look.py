@@ -18,18 +18,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from pipeline.artifacts import CASE_FACTS, CT, GIVEN_FACTS, GIVEN_LABELS, LABELS
-from pipeline.engine.artifacts import SOURCE, Artifact, SourceFolder
-from pipeline.engine.confinement import Channel, Confinement, Made, confined
-from pipeline.engine.exchange import WatchedFolder
-from pipeline.engine.records import record_artifact
-from pipeline.engine.source import list_source
-from pipeline.engine.stage import Findings, StrictParams
-from pipeline.errors import CaseRejected
-from pipeline.files.case_files import CT_FOLDER, choose_files, read_file
-from pipeline.geometry.field_of_view import coarse_copy, knee_extent, metal_mm3, side_signs
-from pipeline.geometry.volume import CtVolume, LabelVolume, border_areas_mm2
-from pipeline.label_review import review_anisotropy, review_clipping
-from pipeline.preflight import (
+from pipeline.commands.preflight import (
     Row,
     SeriesFacts,
     Wanted,
@@ -45,8 +34,19 @@ from pipeline.preflight import (
     unseen_row,
     volume_row,
 )
+from pipeline.commands.request import Request
+from pipeline.engine.artifacts import SOURCE, Artifact, SourceFolder
+from pipeline.engine.confinement import Channel, Confinement, Made, confined
+from pipeline.engine.exchange import WatchedFolder
+from pipeline.engine.records import record_artifact
+from pipeline.engine.source import list_source
+from pipeline.engine.stage import Findings, StrictParams
+from pipeline.errors import CaseRejected
+from pipeline.files.case_files import CT_FOLDER, choose_files, read_file
+from pipeline.geometry.field_of_view import coarse_copy, knee_extent, metal_mm3, side_signs
+from pipeline.geometry.volume import CtVolume, LabelVolume, border_areas_mm2
+from pipeline.labels.review import review_anisotropy, review_clipping
 from pipeline.records import CaseFacts, Side
-from pipeline.request import Request
 from pipeline.stages import anatomy, contact, intake, segment
 
 T = TypeVar("T")
@@ -74,6 +74,9 @@ class _Desk:
 
     def progress(self, done: int, total: int) -> None:
         """Nobody waits for it."""
+
+    def took(self, part: str, seconds: float) -> None:
+        """Nobody asks how long it took."""
 
 
 def examine(request: Request, settings: Settings) -> tuple[Row, ...]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.comparison import Comparison, compare
+from pipeline.kinematics.comparison import Comparison, compare
 from pipeline.kinematics.interpolation import FOUND, moved_from_scan_table
 from pipeline.kinematics.table import Float, Grid, LutTable
 from tests.files.lut_sample import GRID, content

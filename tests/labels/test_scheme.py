@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.case_declaration import label_preset, label_presets
 from pipeline.errors import CaseRejected
-from pipeline.label_scheme import structure_values
+from pipeline.labels.scheme import structure_values
 from pipeline.records import Side
 
 WANTED = ("femur", "tibia", "femoral_cartilage")

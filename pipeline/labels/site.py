@@ -16,8 +16,8 @@ from pipeline.case_declaration import label_preset
 from pipeline.engine.stage import Finding, Severity, StrictParams
 from pipeline.errors import CaseRejected
 from pipeline.geometry.volume import CtVolume, LabelVolume, cropped
-from pipeline.label_scheme import MARGIN_VOXELS, LabelValue, StructureName, structure_values, without_side
-from pipeline.label_taking import Progress, TakenLabels, take_labels
+from pipeline.labels.scheme import MARGIN_VOXELS, LabelValue, StructureName, structure_values, without_side
+from pipeline.labels.taking import Progress, TakenLabels, take_labels
 from pipeline.records import CaseFacts
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def labels_of_commands(
         E-SEG-02; see :func:`pipeline.adapters.site_command.label_map_of`.
     CaseRejected
         E-SEG-03 to E-SEG-06, E-IO-*, E-GEO-*, E-LBL-*; E-SEG-07 when a bone of the knee is not among the labels;
-        those of :func:`pipeline.label_taking.take_labels`.
+        those of :func:`pipeline.labels.taking.take_labels`.
     """
     from pipeline.adapters import site_command  # noqa: PLC0415 - nibabel, which a cached run must not pay for
 

@@ -1,6 +1,6 @@
 """What a look at a case before it is processed has to say: facts to rows of a table, each with what to do next.
 
-Nothing here reads a file; :mod:`pipeline.quick_look` gathers the facts.
+Nothing here reads a file; :mod:`pipeline.commands.quick_look` gathers the facts.
 """
 
 from __future__ import annotations

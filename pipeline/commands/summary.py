@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pipeline.engine.runner import CaseStatus, PlanRow, RunOutcome, StageOutcome, StageStatus
-from pipeline.engine.stage import Severity, Stage, StrictParams
+from pipeline.engine.stage import Severity, StrictParams
 
 #: More reasons than this are read by nobody on a screen; the report has them all.
 MAX_REASONS = 3
@@ -41,10 +41,10 @@ def plan_lines(rows: Sequence[PlanRow]) -> list[str]:
     return [f"{row.stage:<{width}}  {row.action:<4}  {row.reason}".rstrip() for row in rows]
 
 
-def status_lines(status: CaseStatus) -> list[str]:
-    """One line a stage, and how the last run ended."""
+def status_lines(status: CaseStatus, review: str | None = None) -> list[str]:
+    """One line a stage, how the last run ended, and what is said of a review, if there is one."""
     lines = [_stage_line(stage) for stage in status.stages]
-    return [*lines, f"last run: {_last_run(status)}"]
+    return [*lines, f"last run: {_last_run(status)}", *([review] if review else [])]
 
 
 def overview_line(case_id: str, status: CaseStatus) -> str:
@@ -54,33 +54,9 @@ def overview_line(case_id: str, status: CaseStatus) -> str:
     return f"{case_id:<16}  {len(done)}/{len(status.stages)} stages  {seconds:7.1f} s  {_last_run(status)}"
 
 
-def pose_lines(coordinates: Mapping[str, float], motion: Sequence[Sequence[float]]) -> list[str]:
-    """A pose for reading: one line a coordinate with its unit, then the 4x4.
-
-    Parameters
-    ----------
-    coordinates : mapping of str to float
-        Names end in ``_deg`` or ``_mm``.
-    motion : (4, 4)
-        Moves points of the moving body as scanned, LPS mm.
-    """
-    lines = [
-        f"{name.rpartition('_')[0]:<18} {value:10.4f} {name.rpartition('_')[2]}" for name, value in coordinates.items()
-    ]
-    rows = ["  ".join(f"{number:12.6f}" for number in row) for row in motion]
-    return [*lines, "moved_from_scan (LPS, mm):", *rows]
-
-
 def up_to_date(stages: int) -> str:
     """What is said when no stage had anything to do."""
     return f"nothing to do: all {stages} stages are up to date"
-
-
-def report_page(results: Path, flow: Sequence[Stage]) -> Path | None:
-    """The page to open: the packaged one if the case got that far, else the one that qa made."""
-    made = [results / stage.folder / artifact.file for stage in flow for artifact in stage.writes if artifact.is_folder]
-    pages = [folder / "report.html" for folder in made]
-    return next((page for page in reversed(pages) if page.is_file()), None)
 
 
 def _stage_line(stage: StageStatus) -> str:
