@@ -116,7 +116,7 @@ def plan(
 
     Nothing is computed and nothing is written.
 
-    Example: ct2lut plan P001 --set smooth.flexion_degree=8
+    Example: ct2lut plan P001 --set smooth.degree_flexion=8
     """
     from pipeline.commands.summary import plan_lines
     from pipeline.engine.runner import plan_case

@@ -74,7 +74,8 @@ class ExportSource:
     structures : mapping of str to TriangleMesh
         By name, scan space (LPS mm), as scanned.
     bodies : mapping of str to str
-        Structure -> ``reference`` or ``moving``, the first of each body its bone; structures of neither are left out.
+        Structure -> ``reference`` or ``moving``, the first of each its bone; those that a body only carries, as the
+        tibia the fibula, come last; structures of neither are left out.
     landmarks : mapping of str to Vector
         LPS mm.
     """
@@ -118,6 +119,7 @@ def source_of(package: Mapping[str, bytes]) -> ExportSource:
     try:
         content, manifest = decode_lut(package["lut.h5"]), json.loads(package["manifest.json"])
         bodies = {one["structure"]: one["body"] for one in manifest["surfaces"] if one["origin"] != "absent"}
+        bodies |= dict.fromkeys(manifest.get("carried", ()), "moving")
     except (KeyError, TypeError) as error:
         raise ValueError(f"the package is not complete: {error}") from error
     names = sorted(name for name in package if name.startswith("meshes/") and name.endswith(".ply"))

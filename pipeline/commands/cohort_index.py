@@ -98,8 +98,8 @@ def write_overview(places: Places, flow: Sequence[Stage]) -> Overview:
         When the disk fails where the page is written.
     """
     if not places.results.is_dir():
-        problem, action = "The results folder does not exist.", "Name the folder of the results with --results."
-        raise ConfigError("E-OVW-01", problem, action)
+        action = "Name the folder of the results with --results."
+        raise ConfigError("E-OVW-01", "The results folder does not exist.", action)
     if places.page.suffix != ".html":
         problem = f"The page cannot be called {places.page.name}: its name must end in .html."
         raise ConfigError("E-OVW-02", problem, "Give another name with --out, such as index.html.")

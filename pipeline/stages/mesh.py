@@ -163,7 +163,7 @@ def _quality(name: str, result: SurfaceResult) -> MeshQuality:
 def _findings(name: str, result: SurfaceResult, volume: LabelVolume, params: Params) -> Iterator[Finding]:
     tolerance, error = params.volume_tolerance_fraction, result.volume_error
     if abs(error) > tolerance:
-        text = f"The mesh of {name} differs from its label by {error:+.1%} in volume, expected at most {tolerance:.1%}."
+        text = f"The mesh of {name} differs from its label by {error:+.2%} in volume, expected at most {tolerance:.2%}."
         yield Finding("W-MSH-01", Severity.REVIEW, text)
     limit = params.deviation_limit_factor * float(np.linalg.norm(volume.spacing_mm))
     if result.deviation.max_mm > limit:

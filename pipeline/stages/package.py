@@ -66,10 +66,11 @@ What is here
 Space and signs
   Meshes, bodies and 4x4 matrices are in the space of the scan: LPS (DICOM patient space: x to the patient's left,
   y posterior, z superior), millimetres, column vectors. {joint}.glb and opensim/ have spaces of their own, and say so.
-  Flexion +, varus +, internal rotation of the {moving} +, for a right and for a left joint alike.
+  Flexion +, varus +, internal rotation of the moving bone +, for a right and for a left joint alike.
   lut/moved_from_scan[i, j] takes the moving body ({moving}) from where it was scanned to its stable place at
   grid/flexion_deg[i], grid/varus_deg[j]. The reference body ({reference}) does not move.
-  Structures that belong to neither body are shown as scanned: the table says nothing of their motion.
+  What belongs to neither body is shown as scanned; only what the moving bone carries, as the tibia the fibula, goes
+  along with it ("carried" in manifest.json).
   Use an entry only where lut/status is 0 or 1. Do not extrapolate.
 
 Play back in Python (needs numpy and h5py)
@@ -127,8 +128,15 @@ def _content(reads: Inputs) -> LutFileContent:
 
 def _source(reads: Inputs, content: LutFileContent, meshes: Mapping[str, TriangleMesh]) -> ExportSource:
     bodies = {one.structure: one.body for one in reads[SURFACE_ORIGINS] if one.origin != "absent"}
+    bodies |= dict.fromkeys(_carried(reads), "moving")
     landmarks = {one.name: one.position for one in reads[ANATOMY].landmarks}
     return ExportSource(content, meshes, bodies, landmarks)
+
+
+def _carried(reads: Inputs) -> list[str]:
+    """Structures that the report shows moving with the moving body though they are no part of its contact surface."""
+    wanted = reads[_SETTINGS["qa"]].get("pictures", {}).get("carried", [])
+    return [name for name in wanted if name in reads[MESHES]]
 
 
 def _mesh_files(meshes: Mapping[str, TriangleMesh]) -> dict[str, bytes]:
@@ -161,6 +169,7 @@ def _manifest(reads: Inputs, files: Mapping[str, bytes]) -> dict[str, Any]:
         "surfaces": [
             {"body": one.body, "structure": one.structure, "origin": one.origin} for one in reads[SURFACE_ORIGINS]
         ],
+        "carried": _carried(reads),
         # not their names, since a user may have put a patient's name into one
         "sources_sha256": sorted(facts.source_files.values()),
         "settings": {name: reads[artifact] for name, artifact in _SETTINGS.items()},

@@ -39,7 +39,7 @@ REFUSED = ("E-SIDE-01", "The side is not given.", "Add side: right or side: left
 def places(tmp_path: Path) -> Places:
     """Results of P1, which passed, and P2, which needs a look."""
     results = tmp_path / "results"
-    write_finished(results, "P1", PASSED, "left")
+    write_finished(results, "P1", PASSED, "left", sheets(1))
     write_finished(results, "P2", REVIEW)
     return Places(results, results / "index.html")
 

@@ -188,6 +188,20 @@ def test_the_manifest_names_every_file_by_its_hash(files: dict[str, bytes]) -> N
     assert manifest["notice"] == "research use, not for diagnosis"
 
 
+def test_what_the_moving_bone_carries_goes_with_it_in_every_format() -> None:
+    given = reads()
+    fibula = given[MESHES]["tibia"]
+    given.values[MESHES.name] = {**given[MESHES], "fibula": fibula}
+    given.values["qa_settings"] = {"pictures": {"carried": ["fibula", "no_such_bone"]}}
+    out = Out()
+    STAGE.run(given, Params(), out)
+    files = out.values[PACKAGE.name]
+    assert json.loads(files["manifest.json"])["carried"] == ["fibula"]
+    assert source_of(files).names("moving") == ("tibia", "fibula")
+    assert files["knee.glb"] == export_files(source_of(files), ["glb"])["knee.glb"]
+    assert "opensim/Geometry/fibula.stl" in files
+
+
 def test_no_input_file_name_leaves_with_the_package(files: dict[str, bytes]) -> None:
     assert json.loads(files["manifest.json"])["sources_sha256"] == ["a" * 64, "b" * 64]
     assert not [name for name, data in files.items() if SECRET.encode() in data]
