@@ -39,7 +39,7 @@ REFUSED = ("E-SIDE-01", "The side is not given.", "Add side: right or side: left
 def places(tmp_path: Path) -> Places:
     """Results of P1, which passed, and P2, which needs a look."""
     results = tmp_path / "results"
-    write_finished(results, "P1", PASSED, "left", sheets(1))
+    write_finished(results, "P1", PASSED, "left")
     write_finished(results, "P2", REVIEW)
     return Places(results, results / "index.html")
 
@@ -202,6 +202,8 @@ def _spoil_side(folder: Path) -> None:
 
 
 def _spoil_picture(folder: Path) -> None:
+    shutil.rmtree(folder)
+    write_finished(folder.parent, folder.name, REVIEW, images=sheets(3))  # of its own: shared ones may be there already
     (folder / "80_qa" / "report" / "images" / "bones.png").write_bytes(sheets()["slices"])
 
 
