@@ -35,7 +35,7 @@ LOOK = || [ $$? -eq 11 ]
 NEED_ID = if [ -z "$$ID" ]; then echo "Which case? Type: make $@ ID=P001" >&2; exit 20; fi
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo demo-real check patient plan status overview report open verify review test lint format faults fuzz test-browser test-exports bench \
+.PHONY: help setup setup-dev demo demo-real check patient plan status overview report open verify review doctor test lint format faults fuzz test-browser test-exports bench \
 	validate pictures docs lock clean
 
 help:  ## show this list
@@ -84,6 +84,9 @@ verify: setup  ## compare the results of a case with their recorded checksums: m
 
 review: setup  ## keep the decision that the report page saved: make review ID=P001 FILE=P001_review.json
 	@$(NEED_ID); $(BIN)/ct2lut review --results "$$RESULTS" -- "$$ID" "$$FILE"
+
+doctor: setup  ## look whether this machine has what a run needs: make doctor [RESULTS=results]
+	@$(BIN)/ct2lut doctor --results "$$RESULTS"
 
 test: setup-dev  ## run the tests
 	@$(BIN)/python -P -m pytest

@@ -362,6 +362,28 @@ def phantom(
     _say(f"made the case {place}")
 
 
+@app.command()
+def doctor(
+    results: Results = DEFAULT_RESULTS,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for monitoring.")] = False,
+) -> int:
+    """Look whether this machine has what a run needs, in seconds.
+
+    One line for each check: ok, LOOK (a run works, read what to do) or FAIL (mend it first), and what to type. Nothing
+    is left in the results folder, and it is not made. The exit code is 30 where a check failed, else 0.
+
+    Example: ct2lut doctor --results results
+    """
+    from pipeline.commands.doctor import closing, examine, exit_code, json_line, lines
+
+    checks = []
+    for check in examine(results):
+        checks.append(check)
+        _say(*(() if as_json else lines(check)))
+    _say(json_line(checks) if as_json else closing(checks))
+    return exit_code(checks)
+
+
 @app.command(name="compile")
 def compile_solver() -> int:
     """Compile the solver, once after installing: no patient has to wait for it then."""

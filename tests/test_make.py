@@ -35,7 +35,20 @@ HOSTILE = (
     "*",
 )
 
-TARGETS = ("help", "setup", "demo", "demo-real", "check", "patient", "plan", "status", "report", "verify", "review")
+TARGETS = (
+    "help",
+    "setup",
+    "demo",
+    "demo-real",
+    "check",
+    "patient",
+    "plan",
+    "status",
+    "report",
+    "verify",
+    "review",
+    "doctor",
+)
 DEVELOPER_TARGETS = ("test", "lint", "bench", "validate", "clean")
 VARIABLES = ("ID", "CASES", "RESULTS", "PROTOCOL", "SET", "JOBS")
 
@@ -131,10 +144,11 @@ def test_missing_id_is_explained(checkout: Path, target: str) -> None:
     assert f"Type: make {target} ID=P001" in answer.stderr
 
 
+@pytest.mark.parametrize("target", ["overview", "doctor"])
 @pytest.mark.parametrize("hostile", HOSTILE)
-def test_a_folder_arrives_letter_by_letter(checkout: Path, hostile: str) -> None:
-    make(checkout, "overview", f"RESULTS={hostile}")
-    assert "\n".join(arguments(checkout)) == f"overview\n--results\n{hostile}"
+def test_a_folder_arrives_letter_by_letter(checkout: Path, hostile: str, target: str) -> None:
+    make(checkout, target, f"RESULTS={hostile}")
+    assert "\n".join(arguments(checkout)) == f"{target}\n--results\n{hostile}"
     assert not (checkout / "SENTINEL").exists()
 
 

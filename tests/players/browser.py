@@ -115,6 +115,18 @@ class Browser:
         """Parameters of all events of a kind."""
         return [event["params"] for event in self.events if event["method"] == method]
 
+    def complaints(self, *allowed: str) -> list[str]:
+        """All that a page did which a page of ours does not do; ``allowed`` is how addresses may begin."""
+        addresses = [one["request"]["url"] for one in self.said("Network.requestWillBeSent")]
+        entries = [one["entry"] for one in self.said("Log.entryAdded")]
+        return [
+            *(f"asked for {one[:60]}" for one in addresses if not one.startswith(allowed or ("file:", "data:"))),
+            *(one["text"] for one in entries if one["level"] == "error"),
+            *(f"threw {one['exceptionDetails']['text']}" for one in self.said("Runtime.exceptionThrown")),
+            *(f"logged {one['args']}" for one in self.said("Runtime.consoleAPICalled")),
+            *(f"asked a person {one['message']}" for one in self.said("Page.javascriptDialogOpening")),
+        ]
+
     def run(self, expression: str) -> Any:
         """Value of a JavaScript expression in the page; a promise is waited for."""
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)

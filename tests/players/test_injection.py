@@ -43,6 +43,8 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not instal
 
 PICTURE = png(blank(4, 3))
 HARMLESS = "harmless words "
+#: What a page of ours asks for beside itself.
+OURS = ("data:", "blob:")
 #: A text of the program itself that is no words: what the bytes of a picture are.
 FIXED = {"media"}
 #: Each tries another way out of the text; what succeeds sets ``window.hit``, adds an element or asks for something.
@@ -199,26 +201,13 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
         yield one
 
 
-def complaints(browser: Browser) -> list[str]:
-    """Everything that a page did which a page of ours does not do."""
-    addresses = [one["request"]["url"] for one in browser.said("Network.requestWillBeSent")]
-    entries = [one["entry"] for one in browser.said("Log.entryAdded")]
-    return [
-        *(f"asked for {one[:60]}" for one in addresses[1:] if not one.startswith(("data:", "blob:"))),
-        *(one["text"] for one in entries if one["level"] == "error"),
-        *(f"threw {one['exceptionDetails']['text']}" for one in browser.said("Runtime.exceptionThrown")),
-        *(f"logged {one['args']}" for one in browser.said("Runtime.consoleAPICalled")),
-        *(f"asked a person {one['message']}" for one in browser.said("Page.javascriptDialogOpening")),
-    ]
-
-
 def opened(browser: Browser, file: Path, words: str) -> Seen:
     """What a page is and does when it is opened."""
     browser.events.clear()
     browser.open(file)
     browser.run(NEXT_FRAME)
     census = browser.run(f"{CENSUS}({json.dumps(words)})")
-    return Seen(census, "", "", [*complaints(browser), *(["ran"] if census["hit"] else [])])
+    return Seen(census, "", "", [*browser.complaints(file.as_uri(), *OURS), *(["ran"] if census["hit"] else [])])
 
 
 def used(browser: Browser, file: Path, other: Path, words: str) -> Seen:
@@ -236,7 +225,10 @@ def used(browser: Browser, file: Path, other: Path, words: str) -> Seen:
     browser.run(NEXT_FRAME)
     ran = ["ran"] if browser.run("window.hit ?? null") is not None else []
     return Seen(
-        browser.run(f"{CENSUS}({json.dumps(words)})"), ghost, saved, [*seen.complaints, *complaints(browser), *ran]
+        browser.run(f"{CENSUS}({json.dumps(words)})"),
+        ghost,
+        saved,
+        [*seen.complaints, *browser.complaints(file.as_uri(), *OURS), *ran],
     )
 
 

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.adapters import pictures
-from pipeline.adapters.pictures import Image, Text
+from pipeline.adapters.pictures import Image
 from pipeline.geometry.volume import CtVolume
 from pipeline.kinematics.table import Status
 from pipeline.records import Side
@@ -27,20 +26,6 @@ from tests.report.sample import sample_evidence, with_status
 SMALL = PictureSettings(panel_px=150, flexions_deg=[0.0, 90.0])
 Draw = Callable[[Evidence, PictureSettings], Image]
 DRAWN: tuple[Draw, ...] = (slices_picture, bones_picture, poses_picture, contact_picture)
-
-
-@pytest.fixture
-def written(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Every line of text that is drawn."""
-    lines: list[str] = []
-    draw = pictures.draw_text
-
-    def remember(image: Image, text: Text, at: tuple[float, float], align: float = 0.0) -> None:
-        lines.append(text.words)
-        draw(image, text, at, align)
-
-    monkeypatch.setattr(pictures, "draw_text", remember)
-    return lines
 
 
 @pytest.mark.parametrize("side", ["right", "left"])

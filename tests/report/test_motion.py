@@ -8,8 +8,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pipeline.adapters import pictures
-from pipeline.adapters.pictures import Image, Text
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.kinematics.table import Status
 from pipeline.records import Side
@@ -27,20 +25,6 @@ SMALL = PictureSettings(panel_px=150, motion_poses=7)
 LATERAL, ANTERIOR = (slice(86, 236), slice(0, 150)), (slice(86, 236), slice(156, 306))
 #: Where the attitude is written.
 ATTITUDE = (slice(56, 86), slice(None))
-
-
-@pytest.fixture
-def written(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Every line of text that is drawn."""
-    lines: list[str] = []
-    draw = pictures.draw_text
-
-    def remember(image: Image, text: Text, at: tuple[float, float], align: float = 0.0) -> None:
-        lines.append(text.words)
-        draw(image, text, at, align)
-
-    monkeypatch.setattr(pictures, "draw_text", remember)
-    return lines
 
 
 def without(evidence: Evidence, *flexions: int) -> Evidence:
