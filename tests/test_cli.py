@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from pipeline import __version__, cli, config
+from pipeline.commands import doctor
 from pipeline.errors import ExitCode
 from tests.toy_flow import TOY_FLOW, write_toy_configs
 
@@ -277,13 +279,30 @@ def test_a_phantom_is_a_case(ct2lut: Run) -> None:
     assert Path("cases/toy/labels.nrrd").stat().st_size > 0
 
 
+def test_a_doctor_for_people_and_for_monitoring(ct2lut: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "PROBES", {})
+    before = listing(Path())
+    code, out, err = ct2lut("doctor", "--results", "results")
+    assert (code, err) == (ExitCode.PASS, "")
+    assert [line.split()[:2] for line in out.splitlines()[:-1]] == [
+        [n, "ok"] for n in ("disk", "results", "locks", "clock")
+    ]
+    assert out.splitlines()[-1] == "This machine is ready."
+    code, out, err = ct2lut("doctor", "--results", "cases/P001/case.yaml", "--json")
+    told = json.loads(out)
+    assert (code, err, told["ok"]) == (ExitCode.ENVIRONMENT, "", False)
+    assert told["checks"][1]["found"] == "cases/P001/case.yaml is not a folder"
+    assert listing(Path()) == before
+
+
 def test_version_and_help(ct2lut: Run) -> None:
     assert ct2lut("--version") == (0, f"ct2lut {__version__}\n", "")
     code, out, _ = ct2lut()
     assert code == 0
     assert "Research" in out
     assert all(
-        command in out for command in ("run", "check", "plan", "status", "verify", "report", "query", "open", "phantom")
+        command in out
+        for command in ("run", "check", "plan", "status", "verify", "report", "query", "open", "phantom", "doctor")
     )
 
 

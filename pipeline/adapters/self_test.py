@@ -15,6 +15,8 @@ from pipeline.errors import PipelineError
 
 #: What :func:`solver` answers where the machine code of some kernel is not there.
 NOT_COMPILED = "not compiled"
+#: What it answers where machine code could not be kept: a run would end with an error.
+NO_PLACE = "no place for machine code"
 
 _RENDERER = re.compile(r"OpenGL renderer string:\s*(\S+)")
 #: Greek, an arrow and a sign of comparison, which reports have.
@@ -68,15 +70,19 @@ def solver() -> str:
     Returns
     -------
     str
-        ``compiled``, or NOT_COMPILED.
+        ``compiled``, NOT_COMPILED or NO_PLACE.
     """
     _refuse_to_compile()
-    from pipeline.kinematics.direct.warm_up import warm_up  # noqa: PLC0415 - Numba, for this trial only
-
     try:
+        from pipeline.kinematics.direct.warm_up import warm_up  # noqa: PLC0415 - Numba, for this trial only
+
         warm_up()
     except _Compiling:
         return NOT_COMPILED
+    except RuntimeError as error:
+        if "no locator available" not in str(error):
+            raise
+        return NO_PLACE
     return "compiled"
 
 

@@ -70,9 +70,9 @@ def examine(results: Path) -> Iterator[Check]:
     yield checked("disk", partial(doctor_storage.room, results))
     keeping = checked("results", partial(doctor_storage.keeping, results))
     yield keeping
-    for name, probe in (("locks", doctor_storage.locks), ("clock", doctor_storage.clock)):
-        usable = keeping.state is not State.FAIL
-        yield checked(name, partial(probe, results) if usable else _untried)
+    usable = keeping.state is not State.FAIL
+    yield checked("locks", partial(doctor_storage.locks, results) if usable else _untried)
+    yield checked("clock", partial(doctor_storage.clock, results) if usable else _untried)
 
 
 def checked(name: str, probe: Probe) -> Check:

@@ -32,6 +32,7 @@ _TRIAL = f"import sys; from {self_test.__name__} import answer; sys.stdout.write
 _ROOT = str(Path(__file__).resolve().parents[2])
 _INSTALL_RENDERER = f"Install the software renderer: apt-get install -y --no-install-recommends {RENDERER_PACKAGES}"
 _COMPILE = "Compile it once, as the user who installed the program: ct2lut compile"
+_PLACE = "Name a folder that stays, for every run, and compile once: export NUMBA_CACHE_DIR=FOLDER; ct2lut compile"
 _SEAL = (
     "Runs go on and say so. Full protection needs Linux 5.13 or newer with Landlock (cat /sys/kernel/security/lsm)"
     " and, in a container, the runtime's own seccomp profile."
@@ -92,7 +93,7 @@ def _wrong(name: str, bounds: str) -> str:
         version = metadata.version(name)
     except metadata.PackageNotFoundError:
         return f"{name} is missing"
-    if version is None or not SpecifierSet(bounds).contains(version, prereleases=True):
+    if not SpecifierSet(bounds).contains(version, prereleases=True):
         return f"{name} {version}, expected {bounds}"
     return ""
 
@@ -102,6 +103,8 @@ def solver() -> Answer:
     told = try_in_child("solver")
     if told.problem:
         return Answer(f"it cannot be used: {told.problem}", State.FAIL, told.action or _COMPILE)
+    if told.found == self_test.NO_PLACE:
+        return Answer("its machine code has no folder that can be written to", State.FAIL, _PLACE)
     if told.found == self_test.NOT_COMPILED:
         return Answer("not compiled: the first run waits about 60 s for it", State.LOOK, _COMPILE)
     return Answer(f"compiled ({told.seconds:.1f} s)")
@@ -157,7 +160,7 @@ def cohorts() -> Answer:
     try:
         return Answer(f"snakemake {metadata.version('snakemake')}")
     except metadata.PackageNotFoundError:
-        found = "snakemake on the PATH" if shutil.which("snakemake") else "not installed (only needed for make cohort)"
+        found = "snakemake on the PATH" if shutil.which("snakemake") else "not installed; a single case does not need it"
         return Answer(found)
 
 

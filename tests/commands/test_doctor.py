@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -93,7 +96,9 @@ def what_a_run_says_of_the_renderer(monkeypatch: Patch) -> str:
 def test_a_trial_may_end_in_any_way(monkeypatch: Patch, name: str, child: str, found: str) -> None:
     monkeypatch.setattr(doctor_program, "_TRIAL", child)
     monkeypatch.setattr(doctor_program, "TRIAL_SECONDS", 1.0)
+    begun = time.monotonic()
     check = checked(name, doctor.PROBES[name])
+    assert time.monotonic() - begun < 30
     assert check.state is State.FAIL
     assert check.found.endswith(f": {found}")
     assert check.action
@@ -108,8 +113,15 @@ def test_a_trial_that_says_nonsense_is_a_failure(monkeypatch: Patch, said: str) 
 
 
 def test_what_libraries_print_does_not_hide_the_answer(monkeypatch: Patch) -> None:
-    monkeypatch.setattr(doctor_program, "_TRIAL", 'print("advice"); print(\'{"found": "a window"}\', end="")')
-    assert doctor_program.renderer().found.startswith("a window (")
+    monkeypatch.setattr(doctor_program, "_TRIAL", f'print("advice", end=""); {doctor_program._TRIAL}')
+    assert doctor_program.renderer().state is State.OK
+
+
+def test_a_trial_does_not_stand_where_the_user_stands(monkeypatch: Patch, tmp_path: Path) -> None:
+    """Without a home, libraries leave their caches there."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(doctor_program, "_TRIAL", "import json, os; print(json.dumps({'found': os.getcwd()}), end='')")
+    assert doctor_program.try_in_child("renderer").found == "/"
 
 
 def trial(act: Callable[[], str]) -> dict[str, str]:
@@ -120,8 +132,8 @@ def trial(act: Callable[[], str]) -> dict[str, str]:
     return answered
 
 
-def raising(error: BaseException) -> Callable[..., str]:
-    def act(*_: object, **__: object) -> str:
+def raising(error: BaseException) -> Callable[..., Any]:
+    def act(*_: object, **__: object) -> Any:
         raise error
 
     return act
@@ -149,6 +161,15 @@ def test_a_solver_that_is_not_compiled_is_worth_a_look_and_stays_so(tmp_path: Pa
         assert (answer.state, answer.action.rpartition(": ")[2]) == (State.LOOK, "ct2lut compile")
         assert answer.found.startswith("not compiled")
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_machine_code_without_a_place_is_a_failure(monkeypatch: Patch) -> None:
+    """As on a read-only root, for an installation that was not made for one."""
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("NUMBA_CACHE_LOCATOR_CLASSES", "UserProvidedCacheLocator")
+    answer = doctor_program.solver()
+    assert (answer.state, answer.found) == (State.FAIL, "its machine code has no folder that can be written to")
+    assert "export NUMBA_CACHE_DIR=" in answer.action
 
 
 def distributions(monkeypatch: Patch, requires: list[str], **versions: str | None) -> None:
@@ -192,7 +213,7 @@ def test_a_program_that_is_not_installed(monkeypatch: Patch) -> None:
 
 
 def test_an_old_python_is_named(monkeypatch: Patch) -> None:
-    monkeypatch.setattr(doctor_program.platform, "python_version", lambda: "3.10.2")
+    monkeypatch.setattr(platform, "python_version", lambda: "3.10.2")
     answer = doctor_program.interpreter()
     assert (answer.state, answer.found) == (State.FAIL, "CPython 3.10.2 (expected >=3.11)")
     assert "make setup PYTHON=" in answer.action
@@ -218,7 +239,7 @@ def test_a_sealed_child_that_dies_is_a_failure(monkeypatch: Patch) -> None:
 def test_the_engine_of_cohorts_is_no_condition(monkeypatch: Patch) -> None:
     distributions(monkeypatch, [])
     monkeypatch.setattr(shutil, "which", lambda _: None)
-    assert doctor_program.cohorts() == Answer("not installed (only needed for make cohort)")
+    assert doctor_program.cohorts() == Answer("not installed; a single case does not need it")
     monkeypatch.setattr(shutil, "which", lambda _: "/secret/snakemake")
     assert doctor_program.cohorts() == Answer("snakemake on the PATH")
     distributions(monkeypatch, [], snakemake="9.27.1")

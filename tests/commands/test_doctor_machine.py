@@ -124,6 +124,8 @@ def test_low_limits_are_named(machine: Machine, monkeypatch: Patch, need: doctor
     allowed = dict.fromkeys((one.kind for one in doctor_machine.NEEDS), resource.RLIM_INFINITY)
     monkeypatch.setattr(resource, "getrlimit", lambda kind: (allowed[kind], resource.RLIM_INFINITY))
     assert doctor_machine.limits() == Answer("open files unlimited, processes and threads unlimited")
+    allowed[need.kind] = need.least
+    assert doctor_machine.limits().state is State.OK
     allowed[need.kind] = need.least - 1
     answer = doctor_machine.limits()
     assert (answer.state, answer.action) == (State.LOOK, f"Raise it before a run: {need.command}")

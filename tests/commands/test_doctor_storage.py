@@ -7,6 +7,7 @@ import os
 import resource
 import shlex
 import signal
+import stat
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -38,6 +39,11 @@ def test_room_for_results(monkeypatch: Patch, tmp_path: Path, free: int, state: 
     answer = doctor_storage.room(tmp_path / "it's")
     assert (answer.state, answer.found.rpartition(" ")[2]) == (state, str(room))
     assert (shlex.quote(str(tmp_path)) in answer.action) == (state is not State.OK)
+
+
+def test_sizes_are_readable(monkeypatch: Patch, tmp_path: Path) -> None:
+    monkeypatch.setattr(os, "statvfs", disk(12288))
+    assert doctor_storage.room(tmp_path).found.startswith("12 kB of 100.0 GB free; a result takes up to 150 MB: ")
 
 
 def test_a_disk_may_run_out_of_files(monkeypatch: Patch, tmp_path: Path) -> None:
@@ -88,6 +94,27 @@ def test_each_step_is_named(tmp_path: Path, monkeypatch: Patch, call: str, found
     monkeypatch.setattr(os, call, lambda *_, **__: refuse(errno.EROFS))
     check = checked("results", partial(doctor_storage.keeping, tmp_path))
     assert (check.state, check.found) == (State.FAIL, f"{found} failed: the disk is read-only (EROFS).")
+
+
+@pytest.mark.parametrize(
+    ("error", "state", "found"),
+    [
+        (errno.EIO, State.FAIL, "Synchronising a folder failed: the disk or network share reported an error (EIO)."),
+        # what some network shares say
+        (errno.EINVAL, State.OK, "written, synchronised, renamed and deleted"),
+    ],
+)
+def test_a_folder_that_cannot_be_synchronised(
+    tmp_path: Path, monkeypatch: Patch, error: int, state: State, found: str
+) -> None:
+    real = os.fsync
+
+    def fsync(descriptor: int) -> None:
+        real(descriptor) if stat.S_ISREG(os.fstat(descriptor).st_mode) else refuse(error)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    check = checked("results", partial(doctor_storage.keeping, tmp_path))
+    assert (check.state, check.found[: len(found)]) == (state, found)
 
 
 def test_a_disk_that_forgets_is_told(tmp_path: Path, monkeypatch: Patch) -> None:

@@ -190,8 +190,8 @@ def test_the_manifest_names_every_file_by_its_hash(files: dict[str, bytes]) -> N
 
 def test_what_the_moving_bone_carries_goes_with_it_in_every_format() -> None:
     given = reads()
-    fibula = given[MESHES]["tibia"]
-    given.values[MESHES.name] = {**given[MESHES], "fibula": fibula}
+    meshes = given.values[MESHES.name]
+    given.values[MESHES.name] = {**meshes, "fibula": meshes["tibia"]}
     given.values["qa_settings"] = {"pictures": {"carried": ["fibula", "no_such_bone"]}}
     out = Out()
     STAGE.run(given, Params(), out)
