@@ -160,8 +160,8 @@ def cohorts() -> Answer:
     try:
         return Answer(f"snakemake {metadata.version('snakemake')}")
     except metadata.PackageNotFoundError:
-        found = "snakemake on the PATH" if shutil.which("snakemake") else "not installed; a single case does not need it"
-        return Answer(found)
+        there = shutil.which("snakemake") is not None
+        return Answer("snakemake on the PATH" if there else "not installed; a single case does not need it")
 
 
 def try_in_child(trial: str) -> Told:
