@@ -8,6 +8,7 @@ CASES ?= cases
 RESULTS ?= results
 PROTOCOL ?= clinical
 JOBS ?= 0
+DOCKER ?= docker
 override ID := $(value ID)
 override CASES := $(value CASES)
 override RESULTS := $(value RESULTS)
@@ -15,7 +16,9 @@ override PROTOCOL := $(value PROTOCOL)
 override JOBS := $(value JOBS)
 override SET := $(value SET)
 override FILE := $(value FILE)
-export ID CASES RESULTS PROTOCOL JOBS SET FILE
+override BASE := $(value BASE)
+override DOCKER := $(value DOCKER)
+export ID CASES RESULTS PROTOCOL JOBS SET FILE BASE DOCKER
 MAKEOVERRIDES =
 
 # The interpreter that makes the virtual environment; everything else runs inside it.
@@ -35,7 +38,7 @@ LOOK = || [ $$? -eq 11 ]
 NEED_ID = if [ -z "$$ID" ]; then echo "Which case? Type: make $@ ID=P001" >&2; exit 20; fi
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo demo-real check patient plan status overview report open verify review doctor test lint format faults fuzz test-browser test-exports bench \
+.PHONY: help setup setup-dev demo demo-real check patient plan status overview report open verify review doctor test lint format faults fuzz test-browser test-exports test-container image bench \
 	validate pictures docs lock clean
 
 help:  ## show this list
@@ -118,6 +121,20 @@ test-exports: setup-dev  ## put the exports before the validators of their world
 	@build/validators/osim/bin/pip install --quiet opensim
 	@CT2LUT_NODE_MODULES=build/validators/node_modules CT2LUT_OPENSIM_PYTHON=build/validators/osim/bin/python \
 		$(BIN)/python -P -m pytest tests/exports
+
+test-container: setup-dev  ## build the image without Docker and run a patient in it (root; the network, 10 minutes, 5 GB)
+	@[ "$$(id -u)" = 0 ] || { echo "building an image without a daemon needs root; type: sudo make test-container" >&2; exit 30; }
+	@command -v buildah >/dev/null && command -v podman >/dev/null && command -v runc >/dev/null && \
+		command -v debootstrap >/dev/null || { apt-get -qq update && DEBIAN_FRONTEND=noninteractive apt-get install -qq \
+		--no-install-recommends buildah podman runc debootstrap >/dev/null; } || \
+		{ echo "type: apt-get install buildah podman runc debootstrap" >&2; exit 30; }
+	@CT2LUT_TEST_CONTAINER=yes $(BIN)/python -P -m pytest tests/container -rs
+
+image:  ## build the container image ct2lut: make image [BASE=debian:bookworm-slim@sha256:...] [DOCKER=podman]
+	@command -v "$$DOCKER" >/dev/null || { echo "no $$DOCKER on this machine; name another: make image DOCKER=podman" >&2; exit 30; }
+	@set --; if [ -n "$$BASE" ]; then set -- --build-arg "BASE=$$BASE"; fi; \
+		revision=$$(git describe --always --dirty --abbrev=40 2>/dev/null || echo unknown); \
+		BUILDAH_FORMAT=docker "$$DOCKER" build "$$@" --build-arg "REVISION=$$revision" --tag ct2lut .
 
 bench: setup-dev  ## measure speed
 	@$(BIN)/python -m tests.bench
