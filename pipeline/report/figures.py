@@ -169,8 +169,8 @@ BASELINES = Figure(
         "How far these bones overlap (-) or gape (+) along the push on a plain hinge, on a published average motion "
         "(both through the pose of the scan), and in this table.",
         "This table runs along zero, within its limits on the right, whatever the others do.",
-        "This table leaves zero; or the hinge overlaps by more than a millimetre already at the flexion of the scan.",
-        "Overlap at the scan: look for cartilage and menisci that overlap in the label map.",
+        "This table leaves zero; or, with labelled cartilage, the hinge overlaps by over a millimetre at the scan itself.",
+        "Overlap at the scan: look for labels that overlap; steep walls of made menisci may overlap by a millimetre or two.",
     ),
     _baselines,
 )
