@@ -169,8 +169,8 @@ BASELINES = Figure(
         "How far these bones overlap (-) or gape (+) along the push on a plain hinge, on a published average motion "
         "(both through the pose of the scan), and in this table.",
         "This table runs along zero, within its limits on the right, whatever the others do.",
-        "This table leaves zero; or, with labelled cartilage, the hinge overlaps by over a millimetre at the scan itself.",
-        "Overlap at the scan: look for labels that overlap; steep walls of made menisci may overlap by a millimetre or two.",
+        "This table leaves zero; or, with labelled cartilage, the hinge overlaps by over 1 mm at the scan itself.",
+        "Overlap at the scan: look for labels that overlap. Steep walls of made menisci may overlap by 1 to 2 mm.",
     ),
     _baselines,
 )
