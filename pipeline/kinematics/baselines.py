@@ -19,8 +19,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 
 from pipeline.kinematics.contact import Pose
-from pipeline.kinematics.smoothing import Probe, way_to_contact
-from pipeline.kinematics.solvers import ExactSolver
+from pipeline.kinematics.smoothing import Probe
 from pipeline.kinematics.table import Float
 
 #: Flexion over which Walker's curves are published, degrees.
@@ -120,14 +119,3 @@ def probes(baseline: Baseline) -> tuple[Probe, ...]:
     return tuple(
         Probe(flexion, varus, Pose(x, y, z, turn)) for flexion, varus, x, y, z, turn in rows if np.isfinite(turn)
     )
-
-
-def ways_to_contact(solver: ExactSolver, baseline: Baseline) -> Float:
-    """(F,) signed way along delta from each pose to first contact, mm: + a gap, - an overlap.
-
-    NaN where the curve is not published and where nothing is met along delta. Of the direct solver a way is short of
-    contact by 1e-4 mm.
-    """
-    ways = np.full(len(baseline.flexion_deg), np.nan)
-    ways[np.isfinite(baseline.internal_rotation_deg)] = [way_to_contact(solver, one) for one in probes(baseline)]
-    return ways

@@ -6,7 +6,6 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import resources
 from typing import Any, Literal, get_args
 from urllib.parse import quote
 
@@ -15,7 +14,7 @@ import numpy as np
 from pipeline import __version__
 from pipeline.report.figure_frame import RESEARCH_USE
 from pipeline.report.figure_viewer import content_policy
-from pipeline.report.templates import environment, number
+from pipeline.report.templates import environment, number, resource
 
 TEMPLATE = "cohort.html.j2"
 SCRIPT = "cohort.js"
@@ -114,7 +113,7 @@ def cohort_html(rows: Sequence[CaseRow], links: Links) -> bytes:
     """The page; every text from a case is escaped, and without script it is the whole list."""
     import markupsafe  # noqa: PLC0415 - only this command needs it
 
-    script = resources.files("pipeline.report").joinpath(SCRIPT).read_text(encoding="utf-8")
+    script = resource(SCRIPT)
     context = {
         "policy": page_policy(script),
         "script": markupsafe.Markup(script),  # noqa: S704 - our own constant file

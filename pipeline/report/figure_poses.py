@@ -44,7 +44,9 @@ def poses_picture(evidence: Evidence, settings: PictureSettings) -> Image:
     views = [view(evidence.scan_from_reference, side, evidence.scan_from_reference[:3, 3], half) for side in SIDES]
     columns = [_pose_column(evidence, settings, cell, views, colors) for cell in cells]
     rows = [list(row) for row in zip(*columns, strict=True)]
-    return finished(evidence.facts, _poses_title(evidence, settings), [pictures.tiled(rows)], _pose_legend(evidence))
+    return finished(
+        evidence.facts, _poses_title(evidence, settings), [pictures.tiled(rows)], structures_legend(evidence)
+    )
 
 
 def _poses_title(evidence: Evidence, settings: PictureSettings) -> str:
@@ -81,14 +83,18 @@ def _pose_column(
     surfaces = [Surface(evidence.reference, colors[0]), Surface(transformed(evidence.moving, motion), colors[1])]
     surfaces += [
         Surface(transformed(evidence.meshes[name], motion), np.array(structure_color(name), np.uint8))
-        for name in settings.carried
-        if name in evidence.meshes
+        for name in carried(evidence, settings)
     ]
     panels = snapshots(surfaces, views, (size, size))
     for panel, seen in zip(panels, views, strict=True):
         title_panel(panel, _title(cell))
         mark_edges(panel, seen)
     return panels
+
+
+def carried(evidence: Evidence, settings: PictureSettings) -> list[str]:
+    """Structures that go with the moving body though they are no part of its contact surface."""
+    return [name for name in settings.carried if name in evidence.meshes]
 
 
 def body_colors(evidence: Evidence, body: str) -> NDArray[np.uint8]:
@@ -112,7 +118,8 @@ def _nearest_vertex(points: Float, vertices: Float, reach_mm: float = np.inf) ->
     return np.asarray(distance), np.asarray(nearest)
 
 
-def _pose_legend(evidence: Evidence) -> list[tuple[str, Color]]:
+def structures_legend(evidence: Evidence) -> list[tuple[str, Color]]:
+    """Name and colour of each structure of both bodies; in words which of them the program made."""
     words = {"labelled": "{}", "synthesised": "{} (made by the program)"}
     return [
         (words[o.origin].format(plain(o.structure)), structure_color(o.structure))

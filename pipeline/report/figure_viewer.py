@@ -9,7 +9,6 @@ import base64
 import hashlib
 from collections.abc import Iterable, Iterator
 from functools import cache
-from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from pipeline.report.figure_bones import AXIS_SHARE, DELTA_SHARE, half_height_mm
 from pipeline.report.figure_frame import RESEARCH_USE, heading
 from pipeline.report.palette import AXIS, BONE, DELTA, MOVING, Color, hexadecimal, scale, structure_color
 from pipeline.report.settings import PictureSettings
-from pipeline.report.templates import plain
+from pipeline.report.templates import plain, resource
 
 Float = NDArray[np.float64]
 
@@ -47,11 +46,7 @@ SHADES = 33
 @cache
 def scripts() -> tuple[str, str]:
     """Texts of the two scripts of the page: the library, and the module that uses it."""
-    return _text(LIBRARY), "".join(_text(name) for name in MODULE)
-
-
-def _text(name: str) -> str:
-    return resources.files("pipeline.report").joinpath(name).read_text(encoding="utf-8")
+    return resource(LIBRARY), "".join(resource(name) for name in MODULE)
 
 
 def content_policy(allowed: Iterable[str]) -> str:

@@ -24,13 +24,12 @@ from pipeline.report.figure_bones import half_height_mm
 from pipeline.report.figure_frame import (
     MARGIN_PX,
     RESEARCH_USE,
-    Legend,
     heading,
     mark_edges,
     title_panel,
     words_panel,
 )
-from pipeline.report.figure_poses import body_colors
+from pipeline.report.figure_poses import body_colors, carried, structures_legend
 from pipeline.report.figures import Caption, Figure
 from pipeline.report.palette import structure_color
 from pipeline.report.settings import Limits, PictureSettings
@@ -123,22 +122,18 @@ def _attitudes(evidence: Evidence, count: int) -> tuple[Float, float, Float]:
 def _scene(evidence: Evidence, settings: PictureSettings) -> _Scene:
     reference, moving = _fewer(evidence.reference, TRIANGLES), _fewer(evidence.moving, TRIANGLES)
     lighter = replace(evidence, reference=reference, moving=moving)
-    carried = (
+    others = (
         Surface(_fewer(evidence.meshes[name], CARRIED_TRIANGLES), np.array(structure_color(name), np.uint8))
-        for name in _carried(evidence, settings)
+        for name in carried(evidence, settings)
     )
     focus, half = evidence.scan_from_reference[:3, 3], half_height_mm(evidence, settings)
     return _Scene(
         Surface(reference, body_colors(lighter, "reference")),
-        (Surface(moving, body_colors(lighter, "moving")), *carried),
+        (Surface(moving, body_colors(lighter, "moving")), *others),
         tuple(view(evidence.scan_from_reference, side, focus, half) for side in SIDES),
         settings.panel_px,
         _paper(evidence, settings),
     )
-
-
-def _carried(evidence: Evidence, settings: PictureSettings) -> list[str]:
-    return [name for name in settings.carried if name in evidence.meshes]
 
 
 def _fewer(mesh: TriangleMesh, most: int) -> TriangleMesh:
@@ -147,7 +142,8 @@ def _fewer(mesh: TriangleMesh, most: int) -> TriangleMesh:
 
 def _paper(evidence: Evidence, settings: PictureSettings) -> Image:
     """Whose joint it is, notice and legend around the place of the panels, of even height and width."""
-    legend, size = _legend(evidence, settings), settings.panel_px
+    also = [(plain(name), structure_color(name)) for name in carried(evidence, settings)]
+    legend, size = [*structures_legend(evidence), *also], settings.panel_px
     room = pictures.tiled([[pictures.blank(size, size)] * len(SIDES)])
     width = room.shape[1]
     header, key = pictures.blank(width, HEADER_PX), pictures.blank(width, pictures.legend_height(legend, width))
@@ -162,17 +158,6 @@ def _fitting(words: str, width_px: int) -> Text:
     """A heading in letters small enough that nothing of it is cut, and the side stands at its end."""
     full = pictures.text_width(Text(words, HEADING_PX, BOLD))
     return Text(words, min(HEADING_PX, HEADING_PX * width_px // full), BOLD)
-
-
-def _legend(evidence: Evidence, settings: PictureSettings) -> Legend:
-    words = {"labelled": "{}", "synthesised": "{} (made by the program)"}
-    shown = [
-        (origin.structure, words[origin.origin])
-        for origin in evidence.origins
-        if origin.origin in words and origin.structure in evidence.meshes
-    ]
-    shown += [(name, "{}") for name in _carried(evidence, settings)]
-    return [(word.format(plain(name)), structure_color(name)) for name, word in shown]
 
 
 def _frame(scene: _Scene, attitude: str, motion: Float) -> Image:

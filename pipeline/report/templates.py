@@ -19,14 +19,15 @@ def environment() -> Environment:
     import jinja2  # noqa: PLC0415  - a cached run does not need it
 
     made = jinja2.Environment(
-        loader=jinja2.FunctionLoader(_resource), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
+        loader=jinja2.FunctionLoader(resource), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
     )
     made.filters["plain"] = plain
     made.filters["number"] = number
     return made
 
 
-def _resource(name: str) -> str:
+def resource(name: str) -> str:
+    """Text of a file of this package: a template, a style or a script."""
     return resources.files("pipeline.report").joinpath(name).read_text(encoding="utf-8")
 
 

@@ -15,10 +15,9 @@ from pipeline.kinematics.baselines import (
     probes,
     walker,
     walker_motion,
-    ways_to_contact,
 )
 from pipeline.kinematics.joint_coordinates import JointCoordinates, reference_from_moving, rigid, rotation_x
-from pipeline.kinematics.smoothing import Probe
+from pipeline.kinematics.smoothing import Probe, way_to_contact
 from pipeline.kinematics.solvers import ExactSolver
 from pipeline.kinematics.sweep import angles_rad
 from pipeline.kinematics.table import Float
@@ -27,6 +26,13 @@ from tests.kinematics.hollow_joint import FACETS_MM, REST_MM, direct
 PUBLISHED = Path(__file__).resolve().parents[3] / "shared" / "data" / "kinematics_reference"
 SCAN = (12.0, 0.6, -2.0, 1.5, -3.0, -30.0)
 FLEXION = np.arange(-5.0, 126.0, 5.0)
+
+
+def ways_to_contact(solver: ExactSolver, baseline: Baseline) -> Float:
+    """(F,) signed way along delta from each pose to first contact, mm; NaN where the curve is not published."""
+    ways = np.full(len(baseline.flexion_deg), np.nan)
+    ways[np.isfinite(baseline.internal_rotation_deg)] = [way_to_contact(solver, one) for one in probes(baseline)]
+    return ways
 
 
 @pytest.fixture(scope="module")
