@@ -85,7 +85,15 @@ def test_folders_import_in_one_direction(module: Module) -> None:
     if module.package in ("files", "adapters", "report", "labels", *PURE, "engine"):
         assert not {"stages", "commands"} & set(pipeline_imports(module))
     if module.package == "stages":
-        assert "commands" not in set(pipeline_imports(module))
+        assert not {"commands", "cohort"} & set(pipeline_imports(module))
+
+
+@each_module
+def test_what_supervises_cases_never_loads_what_a_case_loads(module: Module) -> None:
+    if module.package == "cohort":
+        assert not {"stages", "adapters", *PURE} & set(pipeline_imports(module))
+    elif module.package != "cli":
+        assert "cohort" not in set(pipeline_imports(module))
 
 
 @each_module
@@ -97,7 +105,7 @@ def test_stages_never_import_one_another(module: Module) -> None:
 
 @each_module
 def test_only_the_command_line_prints_or_exits(module: Module) -> None:
-    if module.name in ("pipeline.cli", "pipeline.__main__"):
+    if module.name == "pipeline.cli" or module.package == "cli":
         return
     for node in ast.walk(module.tree):
         if isinstance(node, ast.Call):

@@ -15,6 +15,7 @@ import pytest
 
 from pipeline import __version__, cli, config
 from pipeline.commands import doctor
+from pipeline.engine.outcome import load_record
 from pipeline.errors import ExitCode
 from tests.toy_flow import TOY_FLOW, write_toy_configs
 
@@ -26,7 +27,7 @@ Run = Callable[..., tuple[int, str, str]]
 def ct2lut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
     """Runs a command of the toy flow in a folder with one good case, P001; returns code, output, error output."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli, "_flow", lambda: TOY_FLOW)
+    monkeypatch.setattr(cli.shared, "flow", lambda: TOY_FLOW)
     monkeypatch.setattr(config, "CONFIGS", write_toy_configs(tmp_path / "configs"))
     write_case(tmp_path / "cases" / "P001")
 
@@ -92,6 +93,25 @@ def test_a_wrong_declaration_is_the_fault_of_the_case(ct2lut: Run) -> None:
     code, _, err = ct2lut("run", "P002")
     assert code == ExitCode.REJECTED
     assert err.startswith("E-CASE-03  case.yaml: side is 'both'; expected right or left.\n")
+
+
+def test_a_wrong_declaration_is_left_where_the_overview_finds_it(ct2lut: Run) -> None:
+    write_case(Path("cases/P002"), "sides: left\n")
+    code, _, err = ct2lut("run", "P002")
+    last = load_record(Path("results/P002"))
+    assert last is not None
+    assert last.outcome is not None
+    assert (code, last.outcome.exit_code, last.outcome.code) == (ExitCode.REJECTED, ExitCode.REJECTED, "E-CASE-02")
+    assert (last.outcome.problem or "-") in err
+    assert ct2lut("status")[1].splitlines()[-1].endswith(f"REJECTED {last.outcome.problem}")
+
+
+def test_a_case_whose_folder_lies_elsewhere(ct2lut: Run) -> None:
+    write_case(Path("elsewhere/scan 7"), "side: left\n")
+    code, out, _ = ct2lut("run", "P007", "--folder", "elsewhere/scan 7")
+    assert code == ExitCode.PASS
+    assert out.splitlines()[0] == "P007   left knee   protocol clinical"
+    assert Path("results/P007/80_qa/report/report.html").is_file()
 
 
 def test_a_missing_case_is_rejected(ct2lut: Run) -> None:
@@ -254,7 +274,7 @@ def test_report_shows_the_page(ct2lut: Run) -> None:
 
 
 def test_a_bug_is_one_line(ct2lut: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cli, "_flow", lambda: 1 / 0)
+    monkeypatch.setattr(cli.shared, "flow", lambda: 1 / 0)
     code, _, err = ct2lut("plan", "P001")
     assert code == ExitCode.ERROR
     assert err.startswith("E-BUG-01  The program failed: ZeroDivisionError")
@@ -265,7 +285,7 @@ def test_a_refusing_system_is_not_a_bug(ct2lut: Run, monkeypatch: pytest.MonkeyP
     def refuse() -> None:
         raise PermissionError(13, "Permission denied", "/secret/place")
 
-    monkeypatch.setattr(cli, "_flow", refuse)
+    monkeypatch.setattr(cli.shared, "flow", refuse)
     code, _, err = ct2lut("plan", "P001")
     assert code == ExitCode.ENVIRONMENT
     assert err.startswith("E-ENV-20  The operating system refused: Permission denied.\n")

@@ -24,5 +24,5 @@ if __name__ == "__main__":
     from tests.waiting_program import wait as imported_wait
 
     config.CONFIGS = write_toy_configs(Path("configs"))
-    cli._flow = lambda: (dataclasses.replace(INTAKE, run=imported_wait),)
+    cli.shared.flow = lambda: (dataclasses.replace(INTAKE, run=imported_wait),)
     cli.main()

@@ -31,6 +31,8 @@ class Request:
     protocol : str
     overrides : tuple of str
         ``stage.key=value``.
+    folder : Path, optional
+        The folder that the user brought, where it is not ``cases/case_id``.
 
     Raises
     ------
@@ -43,19 +45,25 @@ class Request:
     results: Path
     protocol: str
     overrides: tuple[str, ...] = ()
+    folder: Path | None = None
 
     def __post_init__(self) -> None:
         check_case_id(self.case_id)
-        for folder in (self.cases, self.results):
+        for folder in (self.results,) if self.folder else (self.cases, self.results):
             refuse_twin(self.case_id, folder)
+
+    @property
+    def source(self) -> Path:
+        """The folder that the user brought."""
+        return self.folder or self.cases / self.case_id
 
     def job(self) -> CaseJob:
         """The case as the runner wants it."""
-        return CaseJob(self.case_id, self.cases / self.case_id, self.results / self.case_id)
+        return CaseJob(self.case_id, self.source, self.results / self.case_id)
 
     def settings(self, flow: Sequence[Stage]) -> dict[str, StrictParams]:
         """The validated settings of every stage of a flow."""
-        return load_settings(flow, self.cases / self.case_id, self.protocol, self.overrides)
+        return load_settings(flow, self.source, self.protocol, self.overrides)
 
 
 def phantom_spec(assignments: Sequence[str]) -> PhantomSpec:

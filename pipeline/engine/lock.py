@@ -46,13 +46,58 @@ def case_lock(root: Path) -> Iterator[bool]:
     EnvironmentFault
         ``E-LOCK-01`` at once when another run holds it; other codes when the folder cannot be used.
     """
-    with storage(f"Opening the results folder {root.name}"):
+    what = f"the results folder {root.name}"
+    with storage(f"Opening {what}"):
         make_folder(root)
-        descriptor = open_or_create(root / LOCK_FILE, os.O_RDWR)
+    try:
+        with hold(root / LOCK_FILE, what) as locked:
+            yield locked
+    except Held as held:
+        raise EnvironmentFault(
+            "E-LOCK-01",
+            f"Case {root.name} is already running {held.holder}.",
+            "Wait until that run ends, or stop it; nothing was changed.",
+        ) from held
+
+
+class Held(Exception):
+    """Somebody else holds a lock; ``holder`` says since when and which process."""
+
+    def __init__(self, holder: str) -> None:
+        super().__init__(holder)
+        self.holder = holder
+
+
+@contextmanager
+def hold(path: Path, what: str = "", *, wait: bool = False) -> Iterator[bool]:
+    """Hold the lock of a file that stays, in a folder that is there.
+
+    Parameters
+    ----------
+    path : Path
+    what : str
+        What it locks, for messages; the name of the file by default.
+    wait : bool
+        Whether to wait for another holder to end.
+
+    Yields
+    ------
+    bool
+        False where the file system has no locks.
+
+    Raises
+    ------
+    Held
+        When somebody else holds it.
+    EnvironmentFault
+        When the file cannot be opened.
+    """
+    with storage(f"Opening {what or path.name}"):
+        descriptor = open_or_create(path, os.O_RDWR)
     _held.add(descriptor)
     try:
-        with storage(f"Locking the results folder {root.name}"):
-            locked = _acquire(descriptor, root.name)
+        with storage(f"Locking {what or path.name}"):
+            locked = _acquire(descriptor, wait=wait)
         yield locked
     finally:
         _held.discard(descriptor)
@@ -76,11 +121,12 @@ def is_running(root: Path) -> bool:
     return False
 
 
-def _acquire(descriptor: int, case_id: str) -> bool:
+def _acquire(descriptor: int, *, wait: bool) -> bool:
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
     except BlockingIOError as error:
-        raise _busy(descriptor, case_id) from error
+        holder = os.pread(descriptor, 100, 0).decode("ascii", "replace").strip()
+        raise Held(holder or "since a moment ago") from error
     except OSError as error:
         if error.errno in _NO_LOCKS_HERE:
             return False
@@ -89,12 +135,3 @@ def _acquire(descriptor: int, case_id: str) -> bool:
     os.ftruncate(descriptor, 0)
     os.pwrite(descriptor, f"since {started} (pid {os.getpid()})\n".encode(), 0)
     return True
-
-
-def _busy(descriptor: int, case_id: str) -> EnvironmentFault:
-    holder = os.pread(descriptor, 100, 0).decode("ascii", "replace").strip()
-    return EnvironmentFault(
-        "E-LOCK-01",
-        f"Case {case_id} is already running {holder or 'since a moment ago'}.",
-        "Wait until that run ends, or stop it; nothing was changed.",
-    )

@@ -10,7 +10,7 @@ import json
 import os
 import re
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -51,7 +51,7 @@ class RunLog:
         fields = {"ts": now, "id": self.case_id, "stage": line.stage, "level": line.level, "code": line.code}
         event = {**fields, "msg": line.msg, "seconds": None if line.seconds is None else round(line.seconds, 3)}
         with suppress(OSError):
-            _append(self.path, json.dumps(event).replace("\x7f", "\\u007f").encode() + b"\n")
+            append_line(self.path, event)
 
 
 def printable(text: str) -> str:
@@ -72,7 +72,14 @@ def error_id(error: BaseException) -> str:
     return hashlib.sha256("\n".join(_frames(error)).encode()).hexdigest()[:8]
 
 
-def _append(path: Path, line: bytes) -> None:
+def append_line(path: Path, event: Mapping[str, object]) -> None:
+    """Append a JSON object as one line, in one system call; the file is made where it is not there.
+
+    Raises
+    ------
+    OSError
+    """
+    line = json.dumps(event).replace("\x7f", "\\u007f").encode() + b"\n"
     descriptor = open_or_create(path, os.O_RDWR | os.O_APPEND)
     try:
         size = os.fstat(descriptor).st_size

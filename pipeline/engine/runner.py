@@ -57,6 +57,7 @@ __all__ = [
     "StageStatus",
     "plan_case",
     "read_status",
+    "record_refusal",
     "run_case",
     "verify_case",
 ]
@@ -144,6 +145,20 @@ def run_case(
         return _failure(run, error)
 
 
+def record_refusal(job: CaseJob, flow: Sequence[Stage], error: PipelineError) -> RunOutcome:
+    """Leave in the results of a case why it was refused before its first stage.
+
+    Raises
+    ------
+    PipelineError
+        When another run is at work on the case, or the disk fails.
+    """
+    outcome = _stopped(job.case_id, (), flow, error)
+    with _case_opened(job):
+        _close_record(job, outcome)
+    return outcome
+
+
 @contextmanager
 def _case_opened(job: CaseJob) -> Iterator[None]:
     source, results = job.source.resolve(), job.results.resolve()
@@ -169,10 +184,15 @@ def _recorded(run: _Run) -> RunOutcome:
         with suppress(PipelineError):
             save_record(results, RunRecord("interrupted", None))
         raise
-    level: Level = "error" if outcome.problem else "info"
-    run.log.write(LogLine(level, " ".join(filter(None, [outcome.word, outcome.problem])), code=outcome.code))
-    save_record(results, RunRecord("finished", outcome))
+    _close_record(run.job, outcome)
     return outcome
+
+
+def _close_record(job: CaseJob, outcome: RunOutcome) -> None:
+    level: Level = "error" if outcome.problem else "info"
+    line = LogLine(level, " ".join(filter(None, [outcome.word, outcome.problem])), code=outcome.code)
+    RunLog(job.results / LOG_FILE, job.case_id).write(line)
+    save_record(job.results, RunRecord("finished", outcome))
 
 
 def _outcome(run: _Run) -> RunOutcome:
@@ -276,8 +296,10 @@ def _identified(error: BaseException) -> tuple[str, str]:
 
 def _failure(run: _Run, error: PipelineError) -> RunOutcome:
     run.end("failed", error.code)
-    rest = run.flow[len(run.outcomes) :]
-    unreached = [StageOutcome(stage.name, stage.number, "not reached", "", 0.0, ()) for stage in rest]
+    return _stopped(run.job.case_id, run.outcomes, run.flow, error)
+
+
+def _stopped(case_id: str, ended: Sequence[StageOutcome], flow: Sequence[Stage], error: PipelineError) -> RunOutcome:
+    rest = [StageOutcome(stage.name, stage.number, "not reached", "", 0.0, ()) for stage in flow[len(ended) :]]
     word: Word = "REJECTED" if isinstance(error, CaseRejected) else "ERROR"
-    stages = (*run.outcomes, *unreached)
-    return RunOutcome(run.job.case_id, word, error.exit_code, stages, error.code, error.problem, error.action)
+    return RunOutcome(case_id, word, error.exit_code, (*ended, *rest), error.code, error.problem, error.action)

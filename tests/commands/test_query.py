@@ -161,7 +161,7 @@ def test_a_damaged_table_is_no_usage_error(ct2lut: Run) -> None:
 @pytest.fixture
 def report(ct2lut: Run, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The report of P001, in a flow whose last folder is that of qa, on a machine without a display."""
-    monkeypatch.setattr(cli, "_flow", lambda: TOY_FLOW)
+    monkeypatch.setattr(cli.shared, "flow", lambda: TOY_FLOW)
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
         monkeypatch.delenv(name, raising=False)
     page = Path("results/P001/80_qa/report/report.html")

@@ -1,89 +1,38 @@
-"""The command line: the only place that prints or exits.
-
-Heavy libraries are imported inside the commands that need them, so that help and a run with nothing to do are quick.
-"""
+"""The commands of one case."""
 
 from __future__ import annotations
 
 import os
-import signal
 import sys
-import traceback
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from pipeline import __version__
 from pipeline.case_id import check_case_id, is_case_id
-from pipeline.errors import ConfigError, ExitCode, PipelineError
+from pipeline.cli import shared
+from pipeline.cli.shared import (
+    DEFAULT_CASES,
+    DEFAULT_PROTOCOL,
+    DEFAULT_RESULTS,
+    CaseId,
+    Cases,
+    Jobs,
+    Overrides,
+    Protocol,
+    Results,
+    app,
+    say,
+    write,
+)
+from pipeline.errors import CaseRejected, ConfigError, ExitCode, PipelineError
 
 if TYPE_CHECKING:
     from pipeline.commands.request import Request
-    from pipeline.engine.stage import Stage
-
-EXIT_CODES = """Exit codes: 0 PASS, 10 REJECTED (the case cannot be used), 11 REVIEW (look before you use it),
-20 wrong settings or usage, 30 the machine (disk, permission, renderer), 70 an error in the program, 130 interrupted."""
-
-app = typer.Typer(
-    name="ct2lut",
-    help="From the label map of a knee to the look-up table that animates it. Research use - not for diagnosis.",
-    epilog=EXIT_CODES,
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-)
-
-CaseId = Annotated[str, typer.Argument(metavar="ID", help="The case: the name of its folder below --cases.")]
-Cases = Annotated[Path, typer.Option("--cases", help="Folder with one folder a case; never written to.")]
-Results = Annotated[Path, typer.Option("--results", help="Folder for the results, one folder a case.")]
-Protocol = Annotated[str, typer.Option("--protocol", help="Name of a protocol, or a .yaml file of your own.")]
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="STAGE.KEY=VALUE", help="Change one setting; may be given several times."),
-]
-Jobs = Annotated[int, typer.Option("--jobs", min=0, help="Processes to use; 0 means one for each core.")]
-
-DEFAULT_CASES = Path("cases")
-DEFAULT_RESULTS = Path("results")
-DEFAULT_PROTOCOL = "clinical"
-
-
-def main() -> None:
-    """Entry point of the program ``ct2lut``."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    sys.exit(execute(sys.argv[1:]))
-
-
-def execute(arguments: Sequence[str]) -> int:
-    """Run one command; the exit code is returned and every failure is two lines on standard error."""
-    try:
-        code = app(list(arguments) or ["--help"], prog_name="ct2lut", standalone_mode=False) or 0
-    except PipelineError as error:
-        return _complain(f"{error.code}  {error.problem}", error.action, error.exit_code)
-    except typer.TyperException as error:
-        return _complain(f"E-USE-01  {error.format_message()}", "ct2lut --help lists the commands.", ExitCode.USAGE)
-    except OSError as error:
-        problem = f"E-ENV-20  The operating system refused: {error.strerror or type(error).__name__}."
-        return _complain(problem, "Check the folders you named, their permissions and the disk.", ExitCode.ENVIRONMENT)
-    except Exception as error:  # noqa: BLE001 -- the last line of defence: a bug is told in one line
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        problem = f"E-BUG-01  The program failed: {type(error).__name__} in {place.name}, line {place.lineno}."
-        return _complain(problem, "Please report this line and the command you typed.", ExitCode.ERROR)
-    if code == ExitCode.INTERRUPTED:
-        return _complain("Interrupted.", "The same command goes on where this one stopped.", ExitCode.INTERRUPTED)
-    return int(code)
-
-
-@app.callback(invoke_without_command=True)
-def _program(
-    version: Annotated[bool, typer.Option("--version", help="Show the version and stop.")] = False,
-) -> None:
-    if version:
-        print(f"ct2lut {__version__}")
-        raise typer.Exit
+    from pipeline.engine.stage import Stage, StrictParams
 
 
 @app.command()
@@ -94,14 +43,18 @@ def run(
     protocol: Protocol = DEFAULT_PROTOCOL,
     overrides: Overrides = None,
     jobs: Jobs = 0,
+    folder: Annotated[
+        Path | None, typer.Option("--folder", help="The folder of the case, where it is not the one below --cases.")
+    ] = None,
 ) -> int:
-    """Process one case, from its label map to the packaged table.
+    """Process one case, from its CT or label map to the packaged table.
 
     What is up to date is not computed again.
 
     Example: ct2lut run P001 --cases cases --results results --set sweep.flexion_step_deg=2
     """
-    return _run(_request(case_id, cases, results, protocol, overrides), jobs, _flow())
+    request = _request(case_id, cases, results, protocol, overrides)
+    return _run(replace(request, folder=folder), jobs, shared.flow())
 
 
 @app.command()
@@ -122,8 +75,8 @@ def plan(
     from pipeline.engine.runner import plan_case
 
     request = _request(case_id, cases, results, protocol, overrides)
-    flow = _flow()
-    _say(*plan_lines(plan_case(request.job(), flow, request.settings(flow))))
+    flow = shared.flow()
+    say(*plan_lines(plan_case(request.job(), flow, request.settings(flow))))
 
 
 @app.command()
@@ -145,8 +98,8 @@ def check(
     from pipeline.commands.quick_look import examine
 
     request = _request(case_id, cases, results, protocol, overrides)
-    rows = examine(request, request.settings(_flow()))
-    _say(*(line for row in rows for line in lines(row)), *closing(case_id, rows))
+    rows = examine(request, request.settings(shared.flow()))
+    say(*(line for row in rows for line in lines(row)), *closing(case_id, rows))
     return exit_code(rows)
 
 
@@ -165,34 +118,15 @@ def status(
     from pipeline.commands.summary import overview_line, status_lines
     from pipeline.engine.runner import read_status
 
-    flow = _flow()
+    flow = shared.flow()
     if case_id is not None:
         folder = results / check_case_id(case_id)
-        _say(*status_lines(read_status(folder, flow), review_line(ReviewedCase(case_id, folder, flow[-1]))))
+        say(*status_lines(read_status(folder, flow), review_line(ReviewedCase(case_id, folder, flow[-1]))))
         return
     folders = sorted(path for path in results.iterdir() if path.is_dir()) if results.is_dir() else []
-    _say(*(overview_line(path.name, read_status(path, flow)) for path in folders if is_case_id(path.name)))
+    say(*(overview_line(path.name, read_status(path, flow)) for path in folders if is_case_id(path.name)))
     if not folders:
-        _say(f"no results in {results}")
-
-
-@app.command()
-def overview(
-    results: Results = DEFAULT_RESULTS,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="The page to write; index.html in the results by default.")
-    ] = None,
-) -> None:
-    """Write one page of all cases: pictures, verdict, numbers, what is unusual.
-
-    Only what changed since the last time is read again.
-
-    Example: ct2lut overview --results results
-    """
-    from pipeline.commands.cohort_index import Places, overview_lines, write_overview
-
-    page = out or results / "index.html"
-    _say(*overview_lines(write_overview(Places(results, page), _flow()), page))
+        say(f"no results in {results}")
 
 
 @app.command()
@@ -210,7 +144,7 @@ def report(
 
     Example: ct2lut report P001
     """
-    flow = _flow()
+    flow = shared.flow()
     upto = next(index for index, stage in enumerate(flow, 1) if any(a.name == "report" for a in stage.writes))
     return _run(_request(case_id, cases, results, protocol, overrides), jobs, flow[:upto])
 
@@ -223,8 +157,8 @@ def verify(case_id: CaseId, results: Results = DEFAULT_RESULTS) -> int:
     """
     from pipeline.engine.runner import verify_case
 
-    problems = verify_case(results / check_case_id(case_id), _flow())
-    _say(*(problems or (f"{case_id}: every recorded file is as it was written",)))
+    problems = verify_case(results / check_case_id(case_id), shared.flow())
+    say(*(problems or (f"{case_id}: every recorded file is as it was written",)))
     return ExitCode.ENVIRONMENT if problems else ExitCode.PASS
 
 
@@ -239,12 +173,12 @@ def open_page(case_id: CaseId, results: Results = DEFAULT_RESULTS) -> None:
     from pipeline.commands.open_report import open_in_browser
     from pipeline.commands.run_report import report_page
 
-    page = report_page(results / check_case_id(case_id), _flow())
+    page = report_page(results / check_case_id(case_id), shared.flow())
     if page is None:
         raise ConfigError("E-OPN-01", f"{case_id} has no report yet.", f"Make it first: ct2lut report {case_id}.")
-    _say(f"report: {page}")
+    say(f"report: {page}")
     if not open_in_browser(page):
-        _say("No browser here. The page needs nothing else: copy it to a computer that has one and open it there.")
+        say("No browser here. The page needs nothing else: copy it to a computer that has one and open it there.")
 
 
 @app.command()
@@ -271,7 +205,7 @@ def query(
     from pipeline.commands.two_tables import open_table
 
     found = answer(open_table(table, results), Question(flexion, varus, frame, clamp))
-    _say(*([json_line(found)] if as_json else lines(found)))
+    say(*([json_line(found)] if as_json else lines(found)))
 
 
 @app.command()
@@ -294,7 +228,7 @@ def export(
     from pipeline.commands.export_case import ExportRequest, export_case
 
     wanted = tuple(name for name in formats.split(",") if name)
-    _say(*export_case(ExportRequest(case_id, cases, results, wanted, out)))
+    say(*export_case(ExportRequest(case_id, cases, results, wanted, out)))
 
 
 @app.command()
@@ -316,7 +250,7 @@ def compare(
 
     page = compare_cases(first, second, results)
     write_files(out.parent, {out.name: comparison_html(page)})
-    _say(*comparison_lines(page), f"page: {out}")
+    say(*comparison_lines(page), f"page: {out}")
 
 
 @app.command()
@@ -333,8 +267,8 @@ def review(
     """
     from pipeline.commands.review import ReviewedCase, store_review
 
-    kept = store_review(ReviewedCase(check_case_id(case_id), results / case_id, _flow()[-1]), file)
-    _say(f"{case_id}: {kept.sentence}")
+    kept = store_review(ReviewedCase(check_case_id(case_id), results / case_id, shared.flow()[-1]), file)
+    say(f"{case_id}: {kept.sentence}")
 
 
 @app.command()
@@ -359,7 +293,7 @@ def phantom(
 
     place = folder / check_case_id(case_id)
     write_phantom_case(place, phantom_spec(numbers or ()), as_ct=ct)
-    _say(f"made the case {place}")
+    say(f"made the case {place}")
 
 
 @app.command()
@@ -379,8 +313,8 @@ def doctor(
     checks = []
     for check in examine(results):
         checks.append(check)
-        _say(*(() if as_json else lines(check)))
-    _say(json_line(checks) if as_json else closing(checks))
+        say(*(() if as_json else lines(check)))
+    say(json_line(checks) if as_json else closing(checks))
     return exit_code(checks)
 
 
@@ -389,8 +323,8 @@ def compile_solver() -> int:
     """Compile the solver, once after installing: no patient has to wait for it then."""
     from pipeline.kinematics.direct.warm_up import warm_up
 
-    _say("compiling the solver (once, about a minute)")
-    _say(f"the solver is ready ({warm_up():.0f} s)")
+    say("compiling the solver (once, about a minute)")
+    say(f"the solver is ready ({warm_up():.0f} s)")
     return ExitCode.PASS
 
 
@@ -400,13 +334,6 @@ def _request(case_id: str, cases: Path, results: Path, protocol: str, overrides:
     return Request(case_id, cases, results, protocol, tuple(overrides or ()))
 
 
-def _flow() -> tuple[Stage, ...]:
-    """The stages, imported when a command needs them; a test gives others."""
-    from pipeline.flow import FLOW
-
-    return FLOW
-
-
 def _run(request: Request, jobs: int, flow: Sequence[Stage]) -> int:
     from pipeline.adapters.workers import get_ready
     from pipeline.commands.run_report import write_run_page
@@ -414,25 +341,23 @@ def _run(request: Request, jobs: int, flow: Sequence[Stage]) -> int:
     from pipeline.engine.console import console_listener
     from pipeline.engine.runner import Execution, run_case
 
-    settings = request.settings(_flow())
-    _say(header(request.case_id, request.protocol, settings))
-    listener = console_listener(_write, terminal=sys.stdout.isatty())
+    settings = _settings_or_refusal(request)
+    say(header(request.case_id, request.protocol, settings))
+    listener = console_listener(write, terminal=sys.stdout.isatty())
     jobs = jobs or len(os.sched_getaffinity(0))
     execution = Execution(jobs, get_ready) if jobs > 1 else Execution(jobs)
     outcome = run_case(request.job(), flow, settings, execution, listener)
-    _say(*closing(outcome, write_run_page(outcome, request.job().results, flow)))
+    say(*closing(outcome, write_run_page(outcome, request.job().results, flow)))
     return outcome.exit_code
 
 
-def _say(*lines: str) -> None:
-    for line in lines:
-        _write(f"{line}\n")
+def _settings_or_refusal(request: Request) -> dict[str, StrictParams]:
+    """The settings of a case; what its own declaration does wrong is also left where the overview finds it."""
+    from pipeline.engine.runner import record_refusal
 
-
-def _write(text: str) -> None:
-    print(text, end="", flush=True)
-
-
-def _complain(problem: str, action: str, code: ExitCode) -> int:
-    print(f"{problem}\n{action}", file=sys.stderr)
-    return code
+    try:
+        return request.settings(shared.flow())
+    except CaseRejected as error:
+        with suppress(PipelineError):
+            record_refusal(request.job(), shared.flow(), error)
+        raise
