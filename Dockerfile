@@ -18,6 +18,13 @@ WORKDIR /src
 RUN python3 -m venv /opt/ct2lut
 COPY requirements.lock ./
 RUN /opt/ct2lut/bin/pip install --no-cache-dir --require-hashes --requirement requirements.lock
+# The engine of cohorts stands apart: it wants older packages than a run does. Not needed: tests, a solver of plans
+COPY requirements-cohort.lock ./
+RUN python3 -m venv /opt/ct2lut-cohort \
+    && /opt/ct2lut-cohort/bin/pip install --no-cache-dir --require-hashes --requirement requirements-cohort.lock \
+    && /opt/ct2lut-cohort/bin/pip uninstall --yes setuptools pip \
+    && rm -r /opt/ct2lut-cohort/lib/python3.*/site-packages/pandas/tests \
+       /opt/ct2lut-cohort/lib/python3.*/site-packages/pulp/solverdir/cbc
 COPY pyproject.toml README.md LICENSE ./
 COPY pipeline pipeline
 RUN /opt/ct2lut/bin/pip install --no-cache-dir --no-deps --no-build-isolation . \
@@ -31,9 +38,10 @@ RUN apt-get update \
     && apt-get install -y --no-install-recommends python3 libegl1 libgl1-mesa-dri \
        libpango-1.0-0 libpangoft2-1.0-0 libharfbuzz-subset0 fonts-dejavu-core \
     && apt-get clean && rm -rf /var/lib/apt/lists/*
+COPY --from=build /opt/ct2lut-cohort /opt/ct2lut-cohort
 COPY --from=build /opt/ct2lut /opt/ct2lut
 COPY tools/inventory.py /opt/ct2lut/share/inventory.py
-RUN /opt/ct2lut/bin/python /opt/ct2lut/share/inventory.py /opt/ct2lut/share
+RUN /opt/ct2lut/bin/python /opt/ct2lut/share/inventory.py /opt/ct2lut/share /opt/ct2lut-cohort/lib/python3.*/site-packages
 # Works for any user ID, without a home and on a read-only root: what libraries cache goes to /tmp
 ENV PATH=/opt/ct2lut/bin:$PATH \
     PYTHONSAFEPATH=1 \

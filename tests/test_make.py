@@ -43,13 +43,17 @@ TARGETS = (
     "check",
     "patient",
     "plan",
+    "cohort",
+    "resume",
+    "watch",
+    "tidy",
     "status",
     "report",
     "verify",
     "review",
     "doctor",
 )
-DEVELOPER_TARGETS = ("test", "lint", "bench", "validate", "clean")
+DEVELOPER_TARGETS = ("test", "test-cohort", "test-cluster", "scale", "lint", "bench", "validate", "clean")
 VARIABLES = ("ID", "CASES", "RESULTS", "PROTOCOL", "SET", "JOBS")
 
 
@@ -137,19 +141,38 @@ def test_looking_takes_settings_and_no_number_of_jobs(checkout: Path, target: st
     assert arguments(checkout) == [*expected, "--protocol", "clinical", "--", "P001"]
 
 
-@pytest.mark.parametrize("target", ["check", "patient", "plan", "report", "open", "verify"])
+@pytest.mark.parametrize("target", ["check", "patient", "plan", "report", "open"])
 def test_missing_id_is_explained(checkout: Path, target: str) -> None:
     answer = make(checkout, target)
     assert answer.returncode == 2
     assert f"Type: make {target} ID=P001" in answer.stderr
 
 
-@pytest.mark.parametrize("target", ["overview", "doctor"])
+@pytest.mark.parametrize("target", ["overview", "doctor", "resume", "verify"])
 @pytest.mark.parametrize("hostile", HOSTILE)
 def test_a_folder_arrives_letter_by_letter(checkout: Path, hostile: str, target: str) -> None:
     make(checkout, target, f"RESULTS={hostile}")
     assert "\n".join(arguments(checkout)) == f"{target}\n--results\n{hostile}"
     assert not (checkout / "SENTINEL").exists()
+
+
+@pytest.mark.parametrize("hostile", HOSTILE)
+def test_a_profile_arrives_letter_by_letter(checkout: Path, hostile: str) -> None:
+    make(checkout, "cohort", f"PROFILE={hostile}")
+    assert "\n".join(arguments(checkout)).split("\n--profile\n")[1] == hostile
+    assert not (checkout / "SENTINEL").exists()
+
+
+@pytest.mark.parametrize("target", ["cohort", "watch"])
+def test_many_cases_take_settings(checkout: Path, target: str) -> None:
+    make(checkout, target, "CASES=my cases", "SET=sweep.step_deg=2", "JOBS=2")
+    places = ["--cases", "my cases", "--results", "results", "--protocol", "clinical", "--jobs", "2"]
+    assert arguments(checkout)[:11] == [target, "--set", "sweep.step_deg=2", *places]
+
+
+def test_a_number_of_days_arrives(checkout: Path) -> None:
+    make(checkout, "tidy", "DAYS=30")
+    assert arguments(checkout) == ["clean", "--results", "results", "--older-than-days", "30"]
 
 
 def test_status_needs_no_id(checkout: Path) -> None:

@@ -1,4 +1,6 @@
-"""What an installation consists of and under which licences: ``python inventory.py FOLDER`` writes it there.
+"""What an installation consists of and under which licences: ``python inventory.py FOLDER [MORE ...]`` writes it there.
+
+MORE are folders of packages of other environments, such as that of the workflow engine.
 
 ``sbom.json`` is a CycloneDX 1.5 bill of materials, ``licences.txt`` says the same to people. The Dockerfile runs it
 with the image's own Python, so it needs the standard library alone. The same installation gives the same bytes.
@@ -10,7 +12,7 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path, PurePath
@@ -50,9 +52,11 @@ class Part:
     texts: tuple[str, ...]
 
 
-def python_parts() -> list[Part]:
-    """Every distribution that this Python finds, sorted."""
-    return sorted(_python_part(found) for found in metadata.distributions())
+def python_parts(more: Sequence[str] = ()) -> list[Part]:
+    """Every distribution that this Python finds, or that lies in other folders of packages; each once, sorted."""
+    places = (sys.path, *([folder] for folder in more))
+    found = {_python_part(one) for path in places for one in metadata.distributions(path=path)}
+    return sorted({part.purl: part for part in sorted(found, reverse=True)}.values())
 
 
 def debian_parts() -> list[Part]:
@@ -88,30 +92,50 @@ def licence_list(parts: list[Part]) -> str:
     return "\n\n".join(paragraphs) + "\n"
 
 
-def write(folder: Path) -> None:
+def write(folder: Path, more: Sequence[str] = ()) -> None:
     """Write ``sbom.json`` and ``licences.txt`` of this installation into a folder, which is made."""
-    parts = python_parts() + debian_parts()
+    parts = python_parts(more) + debian_parts()
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "sbom.json").write_text(json.dumps(bill(parts), indent=1) + "\n", encoding="utf-8")
     (folder / "licences.txt").write_text(licence_list(parts), encoding="utf-8")
 
 
+def stated_licences(found: metadata.Distribution) -> tuple[str, ...]:
+    """All that a distribution says of its licence, each way of saying it once, the most exact first.
+
+    An SPDX expression, its classifiers in one, the first line of its licence field; where it says nothing so, the first
+    line of the texts that it brings.
+    """
+    described = found.metadata.json
+    kinds = [text.rpartition(" :: ")[2] for text in described.get("classifier", []) if text.startswith("License :: ")]
+    expression, field = (str(described.get(key, "")) for key in ("license_expression", "license"))
+    told = [expression, "; ".join(kinds), _first_line(field)]
+    return tuple(filter(None, told if any(told) else map(_first_line, map(_read, _texts(found)))))
+
+
 def _python_part(found: metadata.Distribution) -> Part:
     described = found.metadata.json
-    name, version, expression = str(described["name"]), found.version, str(described.get("license_expression", ""))
-    texts = sorted({str(found.locate_file(path)) for path in found.files or () if _is_licence_text(path)})
+    name, version, texts = str(described["name"]), found.version, tuple(map(str, _texts(found)))
     purl = f"pkg:pypi/{name.lower().replace('_', '-')}@{quote(version)}"
-    return Part(purl, name, version, expression or _classified(described), bool(expression), tuple(texts))
+    licence = next(iter(stated_licences(found)), UNKNOWN)
+    return Part(purl, name, version, licence, "license_expression" in described, texts)
+
+
+def _texts(found: metadata.Distribution) -> list[Path]:
+    named = {Path(str(found.locate_file(path))) for path in found.files or () if _is_licence_text(path)}
+    return sorted(path for path in named if path.is_file())
+
+
+def _read(path: Path) -> str:
+    return path.read_text(encoding="utf-8", errors="replace")
+
+
+def _first_line(text: str) -> str:
+    return text.strip().partition("\n")[0].strip()
 
 
 def _is_licence_text(path: PurePath) -> bool:
     return path.suffix in LICENCE_SUFFIXES and any(word in path.name.lower() for word in LICENCE_NAMES)
-
-
-def _classified(described: Mapping[str, Any]) -> str:
-    """The licence of a distribution that gives no expression: its classifiers, or the first line of its text."""
-    kinds = [text.rpartition(" :: ")[2] for text in described.get("classifier", []) if text.startswith("License :: ")]
-    return "; ".join(kinds) or str(described.get("license") or UNKNOWN).partition("\n")[0]
 
 
 def _debian_part(name: str, version: str, architecture: str) -> Part:
@@ -134,4 +158,4 @@ def _component(part: Part, kind: str) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    write(Path(sys.argv[1]))
+    write(Path(sys.argv[1]), sys.argv[2:])

@@ -1,21 +1,27 @@
 #!/usr/bin/env bash
-# Install the project into .venv: `tools/setup.sh run`, or `tools/setup.sh dev` with the tools of developers.
+# Install the project into .venv: `tools/setup.sh run`, or `tools/setup.sh dev` with the tools of developers. And
+# `tools/setup.sh cohort` installs the workflow engine into .venv-cohort: it wants other versions than a run does.
 #
-# Nothing is done when the stamp in .venv names the content of every file that decides the installation. As root on
-# Debian or Ubuntu, missing system packages are installed; otherwise the command to type is shown and the exit code is 30.
+# Nothing is done when the stamp in the environment names the content of every file that decides the installation. As
+# root on Debian or Ubuntu, missing system packages are installed; otherwise the command to type is shown and the exit
+# code is 30.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
-kind=${1:?run or dev}
+kind=${1:?run, dev or cohort}
 case $kind in
 run) lock=requirements.lock ;;
 dev) lock=requirements-dev.lock ;;
-*) echo "tools/setup.sh: expected run or dev, got $kind" >&2; exit 20 ;;
+cohort) lock=requirements-cohort.lock ;;
+*) echo "tools/setup.sh: expected run, dev or cohort, got $kind" >&2; exit 20 ;;
 esac
 python=${PYTHON:-python3}
-stamp=.venv/.setup-$kind
+venv=.venv
+[ "$kind" != cohort ] || venv=.venv-cohort
+stamp=$venv/.setup-$kind
 
 wanted() { { pwd; cat "$1" pyproject.toml tools/setup.sh; } | sha256sum; }
+wanted_engine() { { pwd; cat "$lock"; } | sha256sum; }
 
 stop() { # problem, what to do
     printf '%s\n%s\n' "$1" "$2" >&2
@@ -53,9 +59,13 @@ check_python() {
         stop "Python 3.11 or newer is needed; '$python' is not." "Install it, or name one: make setup PYTHON=python3.12"
 }
 
+install_packages_of_lock() {
+    { [ -x $venv/bin/python ] || "$python" -m venv $venv; } &&
+        $venv/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement "$lock"
+}
+
 install_project() {
-    { [ -x .venv/bin/python ] || "$python" -m venv .venv; } &&
-        .venv/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement "$lock" &&
+    install_packages_of_lock &&
         .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 }
 
@@ -69,6 +79,22 @@ fresh_kernels() {
     echo "$now" >.venv/.kernels
 }
 
+# The engine needs nothing of the system but Python, and nothing of the project.
+install_engine() {
+    [ ! -x $venv/bin/snakemake ] || [ "$(cat "$stamp" 2>/dev/null)" != "$(wanted_engine)" ] || return 0
+    check_python
+    "$python" -c 'import ensurepip, venv' 2>/dev/null || stop "This machine lacks python3-venv." \
+        "Type (or ask your administrator to): sudo apt-get install -y --no-install-recommends python3-venv"
+    echo "installing the workflow engine into $venv (about 310 MB, a minute)"
+    install_packages_of_lock ||
+        stop "The workflow engine could not be installed." "Check the network and the free disk space, then run it again."
+    wanted_engine >"$stamp"
+}
+
+if [ "$kind" = cohort ]; then
+    install_engine
+    exit 0
+fi
 if [ -x .venv/bin/python ] && [ "$(cat "$stamp" 2>/dev/null)" = "$(wanted "$lock")" ]; then
     fresh_kernels
     exit 0

@@ -9,7 +9,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, cast
 
 import typer
 
@@ -30,7 +30,7 @@ def main() -> None:
 def execute(arguments: Sequence[str]) -> int:
     """Run one command; the exit code is returned and every failure is two lines on standard error."""
     try:
-        code = app(list(arguments) or ["--help"], prog_name="ct2lut", standalone_mode=False) or 0
+        code = _call(list(arguments)) or 0
     except PipelineError as error:
         return complain(f"{error.code}  {error.problem}", error.action, error.exit_code)
     except typer.TyperException as error:
@@ -45,6 +45,15 @@ def execute(arguments: Sequence[str]) -> int:
     if code == ExitCode.INTERRUPTED:
         return complain("Interrupted.", "The same command goes on where this one stopped.", ExitCode.INTERRUPTED)
     return int(code)
+
+
+def _call(arguments: list[str]) -> int | None:
+    if arguments[2:3] in (["participant"], ["group"]):
+        from pipeline.cohort.bids_call import is_bids_call
+
+        if is_bids_call(arguments, typer.main.get_group(app).commands):
+            return cohort.run_bids_app(arguments)
+    return cast("int | None", app(arguments or ["--help"], prog_name="ct2lut", standalone_mode=False))
 
 
 @app.callback(invoke_without_command=True)

@@ -31,6 +31,7 @@ from pipeline.cli.shared import (
 from pipeline.errors import CaseRejected, ConfigError, ExitCode, PipelineError
 
 if TYPE_CHECKING:
+    from pipeline.commands.doctor_answer import Answer
     from pipeline.commands.request import Request
     from pipeline.engine.stage import Stage, StrictParams
 
@@ -147,19 +148,6 @@ def report(
     flow = shared.flow()
     upto = next(index for index, stage in enumerate(flow, 1) if any(a.name == "report" for a in stage.writes))
     return _run(_request(case_id, cases, results, protocol, overrides), jobs, flow[:upto])
-
-
-@app.command()
-def verify(case_id: CaseId, results: Results = DEFAULT_RESULTS) -> int:
-    """Compare results with their checksums.
-
-    Example: ct2lut verify P001
-    """
-    from pipeline.engine.runner import verify_case
-
-    problems = verify_case(results / check_case_id(case_id), shared.flow())
-    say(*(problems or (f"{case_id}: every recorded file is as it was written",)))
-    return ExitCode.ENVIRONMENT if problems else ExitCode.PASS
 
 
 @app.command(name="open")
@@ -311,11 +299,17 @@ def doctor(
     from pipeline.commands.doctor import closing, examine, exit_code, json_line, lines
 
     checks = []
-    for check in examine(results):
+    for check in examine(results, {"cohorts": _engine}):
         checks.append(check)
         say(*(() if as_json else lines(check)))
     say(json_line(checks) if as_json else closing(checks))
     return exit_code(checks)
+
+
+def _engine() -> Answer:
+    from pipeline.cohort.driver import engine_answer  # a library that is missing is an answer, too
+
+    return engine_answer()
 
 
 @app.command(name="compile")

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pipeline import __version__
+from pipeline.case_id import check_case_id
 from pipeline.cli import shared
 from pipeline.cli.shared import DEFAULT_CASES, DEFAULT_PROTOCOL, DEFAULT_RESULTS, Overrides, Protocol, Results, app, say
 from pipeline.errors import ExitCode
@@ -55,21 +58,12 @@ def cohort(
 
     Example: ct2lut cohort --cases cases --results results --at-once 2
     """
-    from pipeline.cohort.model import CaseLimits
+    from pipeline.cohort.model import CaseLimits, CohortRequest
     from pipeline.cohort.start import Order
 
     limits = CaseLimits(memory_mb, 60.0 * minutes)
-    order = Order(
-        str(cases.resolve()),
-        _absolute(protocol),
-        tuple(overrides or ()),
-        jobs,
-        limits,
-        at_once,
-        batch_size,
-        _absolute(profile),
-        program,
-    )
+    request = CohortRequest(str(cases.resolve()), _absolute(protocol), tuple(overrides or ()), jobs, limits)
+    order = Order(request, at_once, batch_size, _absolute(profile), program)
     return _run_cohort(order, results, retry_failed=retry_failed)
 
 
@@ -86,6 +80,41 @@ def resume(
     from pipeline.cohort.start import last_order
 
     return _run_cohort(last_order(CohortPlace(results.resolve())), results, retry_failed=retry_failed)
+
+
+@app.command()
+def watch(
+    cases: Annotated[Path, typer.Option("--cases", help="Folder into which cases are copied.")] = DEFAULT_CASES,
+    results: Results = DEFAULT_RESULTS,
+    protocol: Protocol = DEFAULT_PROTOCOL,
+    overrides: Overrides = None,
+    jobs: CaseJobs = 1,
+    memory_mb: Memory = 0,
+    minutes: Minutes = DEFAULT_MINUTES,
+    settle: Annotated[
+        float, typer.Option("--settle", help="Seconds without a change that make a case complete.")
+    ] = 60.0,
+    every: Annotated[float, typer.Option("--every", help="Seconds between two looks.")] = 5.0,
+    marker: Annotated[str, typer.Option("--marker", help="File in a case folder that says it is complete.")] = "",
+) -> None:
+    """Process cases as they arrive in a folder, one after the other, until stopped.
+
+    A case is run when it is complete, and again when it has changed. The overview is kept up to date.
+
+    Example: ct2lut watch --cases inbox --results results --marker complete
+    """
+    from pipeline.cohort.case_process import CaseWork, program
+    from pipeline.cohort.inbox import Watch
+    from pipeline.cohort.model import CaseLimits, CohortRequest
+    from pipeline.cohort.place import CohortPlace
+    from pipeline.cohort.serving import server
+    from pipeline.cohort.watch import watch as watch_folder
+
+    limits = CaseLimits(memory_mb, 60.0 * minutes)
+    request = CohortRequest(str(cases.resolve()), _absolute(protocol), tuple(overrides or ()), jobs, limits)
+    place = CohortPlace(results.resolve())
+    run = server(CaseWork(place.results, request, program()), shared.flow())
+    watch_folder(Watch(cases.resolve(), settle, every, marker), place, run, say)
 
 
 @app.command()
@@ -125,6 +154,53 @@ def cohort_summary(results: Results = DEFAULT_RESULTS) -> int:
 
 
 @app.command()
+def verify(
+    case_id: Annotated[str | None, typer.Argument(metavar="[ID]", help="One case; without it, all of them.")] = None,
+    results: Results = DEFAULT_RESULTS,
+    repair: Annotated[
+        bool, typer.Option("--repair", help="Set damaged results aside, so that the next run makes them again.")
+    ] = False,
+) -> int:
+    """Compare results with their checksums.
+
+    The exit code is 30 where something is not as it was written, and 0 after a repair.
+
+    Example: ct2lut verify P001 --repair
+    """
+    from pipeline.commands.repair import case_folders, repair_case, verified_lines, verify_all, verify_one
+
+    flow = shared.flow()
+    if repair:
+        folders = case_folders(results) if case_id is None else [results / check_case_id(case_id)]
+        for folder in folders:
+            say(*repair_case(folder, flow))
+        return ExitCode.PASS
+    damaged = False
+    for found in verify_all(results, flow) if case_id is None else [verify_one(results / check_case_id(case_id), flow)]:
+        say(*verified_lines(found))
+        damaged = damaged or bool(found.problems)
+    return ExitCode.ENVIRONMENT if damaged else ExitCode.PASS
+
+
+@app.command()
+def clean(
+    results: Results = DEFAULT_RESULTS,
+    days: Annotated[float, typer.Option("--older-than-days", help="Age by the clock of the results disk.")] = 7.0,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would go.")] = False,
+) -> int:
+    """Remove what killed runs left behind and damaged results that were set aside; never a result.
+
+    Example: ct2lut clean --results results --dry-run
+    """
+    from pipeline.cohort.cleaning import clean as clean_results
+    from pipeline.cohort.cleaning import cleaned_lines
+
+    done = clean_results(results, days, dry_run=dry_run)
+    say(*cleaned_lines(done))
+    return ExitCode.ENVIRONMENT if done.refused else ExitCode.PASS
+
+
+@app.command()
 def overview(
     results: Results = DEFAULT_RESULTS,
     out: Annotated[
@@ -156,5 +232,24 @@ def _run_cohort(order: Order, results: Path, *, retry_failed: bool) -> int:
     screen = Screen(shared.write, sys.stdout.isatty())
     place = CohortPlace(results.resolve())
     summary = run_cohort(order, place, shared.flow(), screen, retry_failed=retry_failed)
+    say(*summary_lines(summary))
+    return summary.exit_code
+
+
+def run_bids_app(arguments: Sequence[str]) -> int:
+    """The call of a BIDS-App: ``IN OUT participant|group``."""
+    from pipeline.cohort.bids_app import run_participants, summarise_group
+    from pipeline.cohort.bids_call import bids_help, parse_bids_call
+    from pipeline.cohort.case_process import program
+    from pipeline.cohort.summary import summary_lines
+
+    call = parse_bids_call(arguments)
+    say(*call.notes)
+    if call.show:
+        say(f"ct2lut {__version__}" if call.show == "version" else bids_help())
+        return ExitCode.PASS
+    if call.level == "participant":
+        return run_participants(call, program(), shared.flow(), say)
+    summary = summarise_group(call, shared.flow())
     say(*summary_lines(summary))
     return summary.exit_code

@@ -183,6 +183,7 @@ def _stopped(case: CaseOnDisk, last: RunOutcome) -> CaseRow:
         (f"{last.code}  {last.problem}",),
         last.action or "",
         report=case.report if told else "",
+        computing_s=_computing_s(last),
     )
 
 
@@ -190,7 +191,7 @@ def _finished(case: CaseOnDisk, last: RunOutcome, pictures: Path) -> CaseRow:
     every = [finding for stage in last.stages for finding in stage.findings]
     reviews = tuple(dict.fromkeys(one.message for one in every if one.severity is Severity.REVIEW))
     if VERDICT.name not in case.stages:
-        return CaseRow(case.name, last.word, reasons=reviews, report=case.report)
+        return CaseRow(case.name, last.word, reasons=reviews, report=case.report, computing_s=_computing_s(last))
     qa = case.stages[VERDICT.name]
     manifest = load_manifest(case.folder / qa.folder)
     if isinstance(manifest, Unusable):
@@ -206,7 +207,12 @@ def _finished(case: CaseOnDisk, last: RunOutcome, pictures: Path) -> CaseRow:
         report=case.report,
         pictures=_strip(case, manifest, pictures),
         review=_review(case),
+        computing_s=_computing_s(last),
     )
+
+
+def _computing_s(last: RunOutcome) -> float:
+    return round(sum(stage.computing_s for stage in last.stages), 3)
 
 
 def _recorded(case: CaseOnDisk, manifest: Manifest, name: str) -> bytes:

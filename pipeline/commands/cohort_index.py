@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pipeline import __version__
@@ -24,7 +24,8 @@ from pipeline.errors import ConfigError
 from pipeline.report.cohort_page import CaseRow, Links, cohort_html
 
 #: Raised whenever a line is read differently.
-FORMAT = 1
+FORMAT = 2
+Amended = Callable[[Sequence[CaseRow]], tuple[CaseRow, ...]]
 _STRIP = re.compile(r"[0-9a-f]{32}\.jpg")
 
 
@@ -81,7 +82,7 @@ class Places:
 _INDEX = record_artifact("cohort_index", "index.json", Index)
 
 
-def write_overview(places: Places, flow: Sequence[Stage]) -> Overview:
+def write_overview(places: Places, flow: Sequence[Stage], amended: Amended = tuple) -> Overview:
     """Bring the page of all cases up to date.
 
     Parameters
@@ -89,6 +90,9 @@ def write_overview(places: Places, flow: Sequence[Stage]) -> Overview:
     places : Places
     flow : sequence of Stage
         The stages whose results are read.
+    amended : callable
+        From the lines of the cases on disk to the lines to show, such as with cases that have no results; what it adds
+        is not kept in the index.
 
     Raises
     ------
@@ -105,7 +109,8 @@ def write_overview(places: Places, flow: Sequence[Stage]) -> Overview:
         raise ConfigError("E-OVW-02", problem, "Give another name with --out, such as index.html.")
     with storage("Writing the overview"):
         make_folder(places.pictures)
-        overview, index = _read_again(places, flow)
+        found, index = _read_again(places, flow)
+        overview = replace(found, rows=amended(found.rows))
         _replace(places.index, _INDEX.encode(index)[""])
         _replace(places.page, cohort_html(overview.rows, places.links))
         _clear(places.pictures, {row.pictures for row in overview.rows})

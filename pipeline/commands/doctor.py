@@ -33,7 +33,6 @@ PROBES: Mapping[str, Probe] = {
     "processors": doctor_machine.processors,
     "limits": doctor_machine.limits,
     "temporary": doctor_machine.temporary,
-    "cohorts": doctor_program.cohorts,
 }
 _WIDTH = max(map(len, PROBES))
 
@@ -57,15 +56,17 @@ class Check:
     action: str
 
 
-def examine(results: Path) -> Iterator[Check]:
+def examine(results: Path, more: Mapping[str, Probe] = {}) -> Iterator[Check]:
     """Every check, as soon as it is done: some take seconds.
 
     Parameters
     ----------
     results : Path
         Folder for results; never made, and nothing is left in it.
+    more : mapping of str to probe
+        Of what a command may not know; told between those of the machine and those of the folder.
     """
-    for name, probe in PROBES.items():
+    for name, probe in {**PROBES, **more}.items():
         yield checked(name, probe)
     yield checked("disk", partial(doctor_storage.room, results))
     keeping = checked("results", partial(doctor_storage.keeping, results))

@@ -52,13 +52,21 @@ NEEDS = (
 )
 
 
+def total_memory() -> int:
+    """Bytes of memory of this machine, or what a container or a batch system leaves of it."""
+    limits = [int(text) for text in _of_groups("memory.max", "memory", "memory.limit_in_bytes") if text != "max"]
+    return min([_told("MemTotal"), *limits])
+
+
+def usable_processors() -> int:
+    """Processors that this process may use at a time, at least one."""
+    return max(1, int(min([float(_jobs()), *_shares()])))
+
+
 def memory() -> Answer:
     """Memory of this machine, or what a container or a batch system leaves of it, against what a patient takes."""
-    told = dict(line.split(":", 1) for line in (_PROC / "meminfo").read_text().splitlines())
-    total, free = (int(told[key].split()[0]) * 1024 for key in ("MemTotal", "MemAvailable"))
-    limits = [int(text) for text in _of_groups("memory.max", "memory", "memory.limit_in_bytes") if text != "max"]
-    total = min([total, *limits])
-    free, jobs = min(free, total), _jobs()
+    total, jobs = total_memory(), _jobs()
+    free = min(_told("MemAvailable"), total)
     taken = PATIENT_BYTES + PROCESS_BYTES * max(0, jobs - 2)
     found = f"{_gb(total)}, {_gb(free)} of it free; with --jobs {jobs} a patient takes up to {_gb(taken)} (make bench)"
     if total < PATIENT_BYTES:
@@ -77,7 +85,7 @@ def processors() -> Answer:
     found = f"{jobs} of {os.cpu_count()}; a run starts {jobs} processes"
     share = min([float(jobs), *_shares()])
     if share < jobs:
-        action = f"Name the number of processes in every run: --jobs {max(1, int(share))}"
+        action = f"Name the number of processes in every run: --jobs {usable_processors()}"
         return Answer(f"{found} but may use only {share:g} processors at a time", State.LOOK, action)
     return Answer(found)
 
@@ -101,6 +109,12 @@ def temporary() -> Answer:
     except OSError:
         action = "Give it a writable /tmp (container: --tmpfs /tmp), or name a folder: export TMPDIR=FOLDER"
         return Answer("no temporary folder can be made; several processes cannot work together", State.FAIL, action)
+
+
+def _told(key: str) -> int:
+    """Bytes of memory that the kernel tells under this name."""
+    told = dict(line.split(":", 1) for line in (_PROC / "meminfo").read_text().splitlines())
+    return int(told[key].split()[0]) * 1024
 
 
 def _jobs() -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-import shutil
 import signal
 import subprocess
 import sys
@@ -153,15 +152,6 @@ def _unsealed() -> list[str]:
     with confined(Confinement(stage, (), (), lambda *_: None, said.append), lambda _: Made((), {})) as result:
         result()
     return said
-
-
-def cohorts() -> Answer:
-    """Whether the engine for many cases is there; one case needs none."""
-    try:
-        return Answer(f"snakemake {metadata.version('snakemake')}")
-    except metadata.PackageNotFoundError:
-        there = shutil.which("snakemake") is not None
-        return Answer("snakemake on the PATH" if there else "not installed; a single case does not need it")
 
 
 def try_in_child(trial: str) -> Told:

@@ -19,7 +19,7 @@ from pipeline.report.templates import environment, number, resource
 TEMPLATE = "cohort.html.j2"
 SCRIPT = "cohort.js"
 
-State = Literal["UNREADABLE", "ERROR", "REJECTED", "REVIEW", "NOT FINISHED", "RUNNING", "PASS"]
+State = Literal["UNREADABLE", "ERROR", "REJECTED", "REVIEW", "NOT FINISHED", "NOT STARTED", "RUNNING", "PASS"]
 #: Every state, those that need somebody first.
 STATES: tuple[State, ...] = get_args(State)
 
@@ -79,6 +79,8 @@ class CaseRow:
         File name of the strip of thumbnails; empty where there is none.
     review : str
         What a reader decided; empty where nobody did yet.
+    computing_s : float
+        Seconds that its results took to compute, in the last run or in earlier ones; the page does not show them.
     """
 
     case_id: str
@@ -90,6 +92,7 @@ class CaseRow:
     report: str = ""
     pictures: str = ""
     review: str = ""
+    computing_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ import sys
 from pathlib import Path
 from types import TracebackType
 
-PAGE_MB = os.sysconf("SC_PAGE_SIZE") / 1e6
+from pipeline.cohort.descendants import Descendants, resident_mb
+
 EVERY_S = 0.1
 
 
@@ -36,34 +37,10 @@ class PeakMemory:
 
 def watch(root: int, over: int) -> float:
     """The greatest memory of a tree until a file descriptor is closed at its other end, MB."""
-    peak = 0.0
+    peak, family = 0.0, Descendants(root, {os.getpid()})
     while not select.select([over], [], [], EVERY_S)[0]:
-        peak = max(peak, tree_mb(root))
+        peak = max(peak, resident_mb(family.living()))
     return peak
-
-
-def tree_mb(root: int) -> float:
-    """Resident memory of a process and its descendants, MB."""
-    parents = {int(entry.name): _parent(entry) for entry in Path("/proc").iterdir() if entry.name.isdigit()}
-    tree, added = {root}, True
-    while added:
-        more = {pid for pid, parent in parents.items() if parent in tree} - tree
-        tree, added = tree | more, bool(more)
-    return sum(_resident_mb(pid) for pid in tree - {os.getpid()})
-
-
-def _parent(entry: Path) -> int:
-    try:
-        return int((entry / "stat").read_text().rpartition(")")[2].split()[1])
-    except OSError:
-        return -1
-
-
-def _resident_mb(pid: int) -> float:
-    try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * PAGE_MB
-    except OSError:
-        return 0.0
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-import shutil
 import signal
 import subprocess
 import sys
@@ -236,17 +235,14 @@ def test_a_sealed_child_that_dies_is_a_failure(monkeypatch: Patch) -> None:
     assert (answer.state, answer.found) == (State.FAIL, "a sealed process cannot work here: no file could be read")
 
 
-def test_the_engine_of_cohorts_is_no_condition(monkeypatch: Patch) -> None:
-    distributions(monkeypatch, [])
-    monkeypatch.setattr(shutil, "which", lambda _: None)
-    assert doctor_program.cohorts() == Answer("not installed; a single case does not need it")
-    monkeypatch.setattr(shutil, "which", lambda _: "/secret/snakemake")
-    assert doctor_program.cohorts() == Answer("snakemake on the PATH")
-    distributions(monkeypatch, [], snakemake="9.27.1")
-    assert doctor_program.cohorts() == Answer("snakemake 9.27.1")
-
-
 # what is said
+
+
+def test_further_checks_are_told_before_those_of_the_folder(tmp_path: Path, monkeypatch: Patch) -> None:
+    monkeypatch.setattr(doctor, "PROBES", {"python": lambda: Answer("there")})
+    checks = list(doctor.examine(tmp_path, {"cohorts": raising(ImportError("no", name="yaml"))}))
+    assert [check.name for check in checks] == ["python", *NAMES[NAMES.index("cohorts") :]]
+    assert (checks[1].state, checks[1].found) == (State.FAIL, "a Python package cannot be used: yaml")
 
 
 def test_a_check_that_crashes_is_a_failed_check() -> None:

@@ -160,11 +160,26 @@ def test_compiling_while_a_patient_waits_would_be_noticed(patient: Path, site: P
 def test_the_bill_of_materials_names_what_is_inside(image: str) -> None:
     listed = sealed("/opt/ct2lut/share/sbom.json", options=("--entrypoint=/bin/cat",)).text
     urls = {component["purl"].partition("?")[0] for component in json.loads(listed)["components"]}
-    pins = re.findall(r"^([a-z0-9-]+)==([^ ]+)(?= \\$)", (CHECKOUT / "requirements.lock").read_text(), re.MULTILINE)
+    locks = [(CHECKOUT / name).read_text() for name in ("requirements.lock", "requirements-cohort.lock")]
+    pins = [pin for lock in locks for pin in re.findall(r"^([a-z0-9-]+)==([^ ]+)(?= \\$)", lock, re.MULTILINE)]
     built_with = {"cython", "pip", "setuptools", "wheel"}
     assert {f"pkg:pypi/{name}@{version}" for name, version in pins if name not in built_with} <= urls
     assert not [url for url in urls for name in built_with if url.startswith(f"pkg:pypi/{name}@")]
     assert any(url.startswith("pkg:deb/debian/libgl1-mesa-dri@") for url in urls)
+
+
+def test_a_cohort_runs_in_it(patient: Path, site: Path, tmp_path: Path) -> None:
+    """The engine is inside: a case that is known and one that is refused, by the same seal; the table lists both."""
+    shutil.copytree(site / "cases", tmp_path / "cases")
+    shutil.copytree(patient, tmp_path / "results" / "demo")
+    (tmp_path / "cases" / "empty").mkdir()
+    must("chown", "-R", f"{USER}:{USER}", str(tmp_path))
+    tmp_path.chmod(0o755)
+    mounts = (f"--volume={tmp_path}/cases:/cases:ro", f"--volume={tmp_path}/results:/results")
+    answer = sealed("cohort", "--cases", "/cases", "--results", "/results", "--protocol", "demo", options=mounts)
+    assert answer.code == 10, answer.text
+    table = (tmp_path / "results" / "cohort.csv").read_text(encoding="utf-8-sig").splitlines()
+    assert [line.split(",")[:3] for line in table[1:]] == [["demo", "PASS", ""], ["empty", "REJECTED", "E-IO-03"]]
 
 
 def test_the_doctor_finds_it_ready(patient: Path, site: Path) -> None:

@@ -52,6 +52,7 @@ def test_the_label_says_the_licence() -> None:
 
 def test_only_hashes_decide_what_python_installs() -> None:
     installed = [step for line in instructions("RUN") for step in line.split("&&") if "pip install" in step]
-    assert len(installed) == 2
+    assert len(installed) == 3
     assert "--require-hashes --requirement requirements.lock" in installed[0]
-    assert "--no-deps --no-build-isolation" in installed[1]
+    assert "--require-hashes --requirement requirements-cohort.lock" in installed[1]
+    assert "--no-deps --no-build-isolation" in installed[2]

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from tools.inventory import Part, bill, licence_list, write
+from tools.inventory import Part, bill, licence_list, python_parts, stated_licences, write
 
 PURL = re.compile(r"pkg:(pypi|deb/debian)/[A-Za-z0-9.%-]+@[A-Za-z0-9.%~_-]+(\?arch=[a-z0-9]+)?")
 
@@ -76,3 +76,43 @@ def test_an_expression_is_given_as_one_and_a_name_as_a_name() -> None:
     assert document["metadata"]["component"]["licenses"] == [{"expression": "Apache-2.0"}]
     assert document["components"][0]["licenses"] == [{"license": {"name": "BSD License"}}]
     assert licence_list([program, other]) == "ct2lut 1: Apache-2.0\n\nx 2: BSD License\n/x/LICENSE\n"
+
+
+def distribution(folder: Path, name: str, *lines: str, text: str = "") -> None:
+    """One that is installed below a folder of packages, with lines about its licence and a text that it brings."""
+    place = folder / f"{name}-1.0.dist-info"
+    place.mkdir(parents=True)
+    (place / "METADATA").write_text("\n".join(("Metadata-Version: 2.4", f"Name: {name}", "Version: 1.0", *lines, "")))
+    (place / "RECORD").write_text(f"{place.name}/METADATA,,\n{place.name}/LICENSE,,\n{place.name}/gone/LICENSE,,\n")
+    if text:
+        (place / "LICENSE").write_text(text)
+
+
+def test_packages_of_another_environment_are_listed_beside_those_of_this_one(tmp_path: Path) -> None:
+    distribution(tmp_path / "a", "engine", "License: MIT")
+    distribution(tmp_path / "b", "engine", "License: MIT")
+    parts = {part.purl: part for part in python_parts([str(tmp_path / "a"), str(tmp_path / "b")])}
+    assert {"pkg:pypi/engine@1.0", f"pkg:pypi/numpy@{metadata.version('numpy')}"} <= set(parts)
+    assert [part.purl for part in python_parts([str(tmp_path / "a"), str(tmp_path / "b")])] == sorted(parts)
+
+
+@pytest.mark.parametrize(
+    ("lines", "text", "stated"),
+    [
+        (["License-Expression: MIT", "License: as it says\n  below"], "GNU", ("MIT", "as it says")),
+        (["Classifier: License :: OSI Approved :: BSD License", "License: BSD"], "", ("BSD License", "BSD")),
+        (["Classifier: License :: A", "Classifier: License :: B :: C"], "", ("A; C",)),
+        ([], "\n  MIT License \n\nCopyright", ("MIT License",)),
+        ([], "", ()),
+    ],
+)
+def test_what_a_distribution_says_of_its_licence(
+    tmp_path: Path, lines: list[str], text: str, stated: tuple[str, ...]
+) -> None:
+    distribution(tmp_path, "any", *lines, text=text)
+    (found,) = metadata.distributions(path=[str(tmp_path)])
+    assert stated_licences(found) == stated
+    part = next(part for part in python_parts([str(tmp_path)]) if part.name == "any")
+    assert part.licence == (stated[0] if stated else "not stated")
+    assert part.is_expression == (lines[:1] == ["License-Expression: MIT"])
+    assert [Path(path).name for path in part.texts] == (["LICENSE"] if text else [])

@@ -1,0 +1,62 @@
+"""Processes that carry a mark in their environment: all that a command started, orphans as well."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+
+#: Name of the variable.
+VARIABLE = "CT2LUT_TEST_MARK"
+
+
+def marked(mark: str) -> Mapping[int, tuple[str, ...]]:
+    """Number of each living process with this mark -> its arguments; never this process itself."""
+    wanted = f"{VARIABLE}={mark}".encode()
+    found = {}
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit() and int(folder.name) != os.getpid():
+            with suppress(OSError):  # it has ended, or belongs to someone else
+                if wanted in (folder / "environ").read_bytes().split(b"\0"):
+                    words = (folder / "cmdline").read_bytes().split(b"\0")
+                    found[int(folder.name)] = tuple(word.decode(errors="replace") for word in words[:-1])
+    return found
+
+
+def kill(*pids: int) -> None:
+    """SIGKILL, each by its number."""
+    for pid in pids:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
+def kill_all(mark: str, patience_s: float = 30.0) -> None:
+    """SIGKILL every process with this mark until none is left.
+
+    Raises
+    ------
+    TimeoutError
+        When some are still there after so many seconds.
+    """
+    until = time.monotonic() + patience_s
+    while left := marked(mark):
+        if time.monotonic() > until:
+            raise TimeoutError(f"{len(left)} processes do not end")
+        kill(*left)
+        time.sleep(0.05)
+
+
+def outlived(mark: str, patience_s: float = 5.0) -> tuple[str, ...]:
+    """What is still there after so many seconds, by its arguments."""
+    until = time.monotonic() + patience_s
+    while (left := marked(mark)) and time.monotonic() < until:
+        time.sleep(0.1)
+    return tuple(sorted(" ".join(words) for words in left.values()))
+
+
+def engines(mark: str) -> tuple[int, ...]:
+    """Those that are the workflow engine itself."""
+    return tuple(pid for pid, words in marked(mark).items() if len(words) > 1 and words[1].endswith("/snakemake"))
