@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import forkserver, get_all_start_methods, get_context
+from functools import partial
+from multiprocessing import forkserver, get_all_start_methods, get_context, parent_process
+from multiprocessing.connection import wait
 from multiprocessing.context import BaseContext, ForkServerContext
+from threading import Thread
 from typing import TypeVar
 
 from pipeline.errors import EnvironmentFault
@@ -48,7 +53,8 @@ def map_in_order(
     """
     if jobs <= 1 or len(tasks) <= 1:
         return _in_this_process(work, tasks, done)
-    with ProcessPoolExecutor(min(jobs, len(tasks)), _context(), initializer=prepare) as pool:
+    begin = partial(_begin, prepare)
+    with ProcessPoolExecutor(min(jobs, len(tasks)), _context(), initializer=begin) as pool:
         try:
             futures = [pool.submit(work, task) for task in tasks]
             _report(futures, done)
@@ -77,6 +83,20 @@ def _context() -> BaseContext:
     context = get_context("forkserver")
     context.set_forkserver_preload(["__main__", *PRELOADED])
     return context
+
+
+def _begin(prepare: Callable[[], object] | None) -> None:
+    """What a worker does first; from then on it ends with the run, also with one that is killed."""
+    parent = parent_process()
+    if parent is not None:
+        Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+    if prepare is not None:
+        prepare()
+
+
+def _end_with(sentinel: int) -> None:
+    wait([sentinel])
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def _in_this_process(work: Callable[[T], R], tasks: Sequence[T], done: Callable[[int], None]) -> list[R]:

@@ -26,6 +26,8 @@ GRACE_S = 5.0
 GRACE_FACTOR = 1.25
 
 _FIRST_LOOK_S = 0.02
+#: Longer than it takes to start a process.
+_SECOND_LOOK_S = 0.03
 #: What a program that came to its end left behind may take so long to notice it.
 _REMAINS_S = 1.0
 _DRAIN_S = 0.2
@@ -173,7 +175,7 @@ class _Run:
         """Wait until it ends by itself, or needs more than it may."""
         pause, limits = _FIRST_LOOK_S, self.limits
         while self.process.poll() is None:
-            held = resident_mb(self.family.living())
+            held = self._held_mb()
             self.peak_mb = max(self.peak_mb, held)
             if 0 < limits.memory_mb < held:
                 return "memory"
@@ -183,6 +185,14 @@ class _Run:
                 self.process.wait(self.output.listen(pause))
             pause = min(2 * pause, LOOK_S)
         return ""
+
+    def _held_mb(self) -> float:
+        """Memory of all of it; while it starts a child, one look may count it twice."""
+        held = resident_mb(self.family.living())
+        if held <= self.peak_mb:
+            return held
+        time.sleep(_SECOND_LOOK_S)
+        return min(held, resident_mb(self.family.living()))
 
     def stop(self) -> None:
         """Ask all of it to end, and give it a moment."""

@@ -3,6 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
@@ -51,3 +58,26 @@ def test_a_failure_that_we_understand_comes_home_whole(jobs: int) -> None:
 def test_a_worker_that_dies_is_the_machines_fault() -> None:
     with pytest.raises(EnvironmentFault, match=r"E-ENV-30 A worker process ended .* fewer workers"):
         map_in_order(die, [1, 2, 3], 2)
+
+
+def test_workers_end_with_a_run_that_is_killed(tmp_path: Path) -> None:
+    """They would hold hundreds of megabytes, and wait for tasks that never come."""
+    program = [sys.executable, "-P", "-c", "from tests.adapters.worker_tasks import two_that_linger; two_that_linger()"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "LINGER": str(tmp_path)}
+    with subprocess.Popen(program, env=environment, start_new_session=True) as run:
+        try:
+            pids = when(lambda: [int(path.name) for path in tmp_path.iterdir()], lambda found: len(found) == 2)
+            run.kill()
+            gone = when(lambda: [pid for pid in pids if Path(f"/proc/{pid}/cmdline").exists()], lambda left: not left)
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(run.pid, signal.SIGKILL)
+    assert gone == []
+
+
+def when(look: Callable[[], list[int]], enough: Callable[[list[int]], bool]) -> list[int]:
+    """What is seen when it is enough, or after a minute."""
+    until = time.monotonic() + 60
+    while not enough(found := look()) and time.monotonic() < until:
+        time.sleep(0.05)
+    return found

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import time
+from pathlib import Path
 
+from pipeline.adapters.workers import map_in_order
 from pipeline.errors import CaseRejected
 
 _prepared = False
@@ -35,3 +38,14 @@ def reject(task: int) -> int:
 def die(_task: int) -> int:
     """End the process as a machine short of memory does."""
     os._exit(9)
+
+
+def linger(folder: str) -> None:
+    """Say which process this is, and wait for five minutes."""
+    (Path(folder) / str(os.getpid())).touch()
+    time.sleep(300)
+
+
+def two_that_linger() -> None:
+    """A run whose two workers linger."""
+    map_in_order(linger, [os.environ["LINGER"]] * 2, 2)
