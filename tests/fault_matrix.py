@@ -98,4 +98,27 @@ ROWS: dict[str, Row] = {
     "V21": Row("headers that point to other files", "refused"),
     "V22": Row("compression bombs, sizes beyond reason", "refused before anything is inflated or allocated"),
     "V23": Row("segmentations with layers or offsets", "offsets are followed; overlapping layers refused"),
+    "I01": Row("IDs that are paths, options, device names, blanks, other alphabets", "refused before anything is made"),
+    "I02": Row("commands typed as an ID or a folder", "text like any other; nothing is run"),
+    "I04": Row("IDs that differ only in upper and lower case", "the second is refused"),
+    "I05": Row(
+        "lists of cases: encodings, separators, formula cells, an ID or a folder twice, missing folders",
+        "read, or refused with the line before anything begins; 0012 stays 0012",
+    ),
+    "S03": Row("SIGTERM or Ctrl-C at any time", "the case and all that it started end; the same command goes on"),
+    "S06": Row("the disk fills", "nothing new is begun, three equal faults stop a batch; nothing finished is lost"),
+    "S09": Row("the same batch started twice", "the second waits, then finds all done"),
+    "S12": Row(
+        "clocks that differ, times in the future", "a batch whose list changed runs again, whatever the clocks say"
+    ),
+    "S16": Row(
+        "the command, the engine or a job killed by SIGKILL",
+        "the same command brings every case to its result; what was finished is not computed again",
+    ),
+    "S17": Row(
+        "a case that crashes, hangs, takes all memory, floods the screen, leaves processes",
+        "stopped at its limits with a reason; nothing of it lives on, the next case is not touched",
+        "a process that changes its user cannot be stopped by us",
+    ),
+    "X12": Row("texts that a spreadsheet takes for formulas", "a leading apostrophe; numbers stay numbers"),
 }

@@ -17,6 +17,7 @@ def test_good_ids(case_id: str) -> None:
     assert check_case_id(case_id) == case_id
 
 
+@pytest.mark.fault("I01")
 @pytest.mark.parametrize(
     "case_id",
     [
@@ -41,6 +42,7 @@ def test_an_accepted_id_is_one_plain_name(text: str) -> None:
     assert text.replace("-", "").replace("_", "").isalnum()
 
 
+@pytest.mark.fault("I04")
 def test_twins_that_differ_in_case_only(tmp_path: Path) -> None:
     (tmp_path / "P1").mkdir()
     refuse_twin("P1", tmp_path)

@@ -86,6 +86,7 @@ def arguments(checkout: Path) -> list[str]:
     return (checkout / "ARGUMENTS").read_text().split("ct2lut\n", 1)[1].splitlines()
 
 
+@pytest.mark.fault("I02")
 @pytest.mark.parametrize("way", ["command line", "environment", "environment -e"])
 @pytest.mark.parametrize("variable", VARIABLES)
 def test_nothing_typed_is_run(checkout: Path, variable: str, way: str) -> None:
@@ -97,6 +98,7 @@ def test_nothing_typed_is_run(checkout: Path, variable: str, way: str) -> None:
         assert not (checkout / "SENTINEL").exists(), hostile
 
 
+@pytest.mark.fault("I02")
 @pytest.mark.parametrize("way", ["command line", "environment"])
 @pytest.mark.parametrize("target", ["check", "patient", "plan", "report", "open", "verify", "status"])
 @pytest.mark.parametrize("hostile", HOSTILE)

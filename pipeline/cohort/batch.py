@@ -66,6 +66,9 @@ def run_batch(batch: Batch) -> tuple[CaseEnd, ...]:
         faults = [end for end in ends if end.transient]
         if faults:
             raise _unfinished(faults)
+        if load_batch(batch.place, batch.name) != cases:  # this one outlived its engine, and a new plan was made
+            problem = f"The list of {batch.name} changed while it was at work."
+            raise EnvironmentFault("E-BAT-03", problem, "Nothing is to be done: the batch is tried again.")
         replace_file(batch.place.done(batch.name), _rows(ends))
     return tuple(ends)
 

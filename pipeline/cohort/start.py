@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pipeline.cohort.batches import PlanInputs, bucket_count, default_batch_size, load_plan, write_plan
 from pipeline.cohort.case_list import listed_cases
 from pipeline.cohort.case_process import program as own_program
-from pipeline.cohort.driver import Engine, EngineEnd, find_engine, run_engine, wait_for_driver
+from pipeline.cohort.driver import find_engine, is_driven, run_engine, wait_for_driver
 from pipeline.cohort.key import plan_key
 from pipeline.cohort.model import CohortRequest, ListedCase, Plan
 from pipeline.cohort.place import CohortPlace
@@ -26,7 +26,6 @@ from pipeline.errors import ConfigError, EnvironmentFault
 #: How often the engine tries a batch again that ended in a fault of the machine.
 RETRIES = 2
 LOCAL_PROFILE = "workstation"
-DRIVER_AT_WORK = "E-ENG-02"
 
 
 @dataclass(frozen=True)
@@ -79,8 +78,11 @@ def run_cohort(
         When the engine is missing or the disk fails.
     """
     engine = find_engine(order.profile, order.at_once)
+    if is_driven(place):
+        _follow_other(place, screen)
     plan = plan_cohort(order, place, flow, retry_failed=retry_failed)
-    end = _at_work(place, plan, engine, screen)
+    with _reported(place, plan, screen) as tick:
+        end = run_engine(place, engine, tick)
     summary = write_summary(place, plan, flow)
     if not end.ok and summary.unfinished == 0:
         raise EnvironmentFault("E-COH-01", f"The workflow engine failed: {end.said}", f"Read {place.engine_log.name}.")
@@ -130,15 +132,17 @@ def _buckets(order: Order, place: CohortPlace, cases: Sequence[ListedCase]) -> i
     return bucket_count(len(cases), size, before)
 
 
-def _at_work(place: CohortPlace, plan: Plan, engine: Engine, screen: Screen) -> EngineEnd:
+def _follow_other(place: CohortPlace, screen: Screen) -> None:
+    """Nothing is planned anew below a driver that is at work."""
+    screen.write("The cohort is at work already. Its progress is shown; then this command goes on.\n")
+    with _reported(place, load_plan(place), screen) as tick:
+        wait_for_driver(place, tick)
+
+
+@contextmanager
+def _reported(place: CohortPlace, plan: Plan, screen: Screen) -> Iterator[Callable[[], None]]:
     reporter = Reporter(place, plan, screen.write, terminal=screen.terminal)
     try:
-        return run_engine(place, engine, reporter.tick)
-    except EnvironmentFault as fault:
-        if fault.code != DRIVER_AT_WORK:
-            raise
-        screen.write(f"{fault.problem} Its progress is shown until it ends.\n")
-        wait_for_driver(place, reporter.tick)
-        return run_engine(place, engine, reporter.tick)
+        yield reporter.tick
     finally:
         reporter.close()

@@ -93,6 +93,7 @@ def test_a_fault_of_the_machine_is_no_result(place: CohortPlace, play: Play) -> 
     assert not place.done(NAME).exists()
 
 
+@pytest.mark.fault("S06")
 def test_three_equal_faults_stop_the_batch(place: CohortPlace, play: Play) -> None:
     ran = play({"P2": FULL, "P3": FULL, "P4": FULL})
     with pytest.raises(EnvironmentFault, match="No result yet of P2, P3, P4"):
@@ -108,6 +109,7 @@ def test_faults_of_different_kinds_do_not(place: CohortPlace, play: Play) -> Non
     assert ran == list(IDS)
 
 
+@pytest.mark.fault("S06")
 def test_nothing_is_begun_on_a_full_disk(place: CohortPlace, play: Play, monkeypatch: pytest.MonkeyPatch) -> None:
     ran = play({})
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=499_000_000))
@@ -127,6 +129,7 @@ def test_a_later_attempt_waits_first(place: CohortPlace, play: Play, attempt: in
     assert {event.attempt for event in history(place)} == {attempt}
 
 
+@pytest.mark.fault("S09")
 def test_a_second_run_of_a_batch_waits_for_the_first(place: CohortPlace, play: Play) -> None:
     ran = play({})
     lock = place.batch_lock(NAME)
@@ -140,6 +143,18 @@ def test_a_second_run_of_a_batch_waits_for_the_first(place: CohortPlace, play: P
     assert (waiting, before) == (True, [])
     assert ran == list(IDS)
     assert place.done(NAME).exists()
+
+
+def test_a_batch_whose_list_changed_meanwhile_is_not_done(
+    place: CohortPlace, play: Play, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As when it outlived its engine, and the same command was given again with one case more."""
+    play({})
+    lists = iter([load_batch(place, NAME), load_batch(place, NAME)[:-1]])
+    monkeypatch.setattr(under_test, "load_batch", lambda *_: next(lists))
+    with pytest.raises(EnvironmentFault, match="E-BAT-03 The list of bucket-0000 changed"):
+        run_batch(Batch(place, NAME, ("ct2lut",)))
+    assert not place.done(NAME).exists()
 
 
 def test_a_batch_that_is_not_there(place: CohortPlace, play: Play) -> None:

@@ -239,6 +239,7 @@ def test_nothing_is_written_when_nothing_changed(tmp_path: Path) -> None:
     assert {path: path.stat().st_mtime_ns for path in place.files.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.fault("S12")
 def test_a_case_more_or_a_changed_file_runs_one_batch_again(tmp_path: Path) -> None:
     place, cases = CohortPlace(tmp_path / "r"), sources(tmp_path / "c", *(f"P{number}" for number in range(40)))
     plan = write_plan(place, inputs(cases, 8))

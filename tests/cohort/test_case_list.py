@@ -79,6 +79,7 @@ def test_a_name_that_is_not_utf_8_is_shown_in_plain_letters(tmp_path: Path) -> N
     assert caught.value.problem.isprintable()
 
 
+@pytest.mark.fault("I04")
 def test_names_that_differ_only_in_case_refuse_the_folder(tmp_path: Path) -> None:
     folders(tmp_path, "p1", "P1", "P2")
     with pytest.raises(ConfigError, match=r"E-LST-05 .* upper and lower case: P1 and p1"):
@@ -103,6 +104,7 @@ def test_nothing_to_do(tmp_path: Path) -> None:
 # A list
 
 
+@pytest.mark.fault("I05")
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
 @pytest.mark.parametrize("bom", [b"", b"\xef\xbb\xbf"])
@@ -140,23 +142,27 @@ def refused(tmp_path: Path, content: str | bytes, match: str) -> str:
     return caught.value.problem
 
 
+@pytest.mark.fault("I05")
 @pytest.mark.parametrize("cell", ["=1+1", "@SUM(A1)", "../x", "-rf", "P1 ", "a.b", "Doe^John", "CON", "x" * 65, ""])
 def test_cells_that_are_no_ids(tmp_path: Path, cell: str) -> None:
     problem = refused(tmp_path, f"id,name\nP1,x\n# skip\n{cell},x\n", "E-LST-04 .* IDs that are not valid: line 4")
     assert problem.isprintable()
 
 
+@pytest.mark.fault("I05")
 def test_the_first_three_lines_are_named(tmp_path: Path) -> None:
     problem = refused(tmp_path, 'remark,id\n"two\nlines",+1\nx,=2\nx,OK\nx,-3\nx,@4\n', "E-LST-04 ")
     assert problem.endswith('line 2 ("+1"), line 4 ("=2"), line 6 ("-3") and 1 more.')
 
 
+@pytest.mark.fault("I05")
 def test_the_same_id_twice(tmp_path: Path) -> None:
     folders(tmp_path, "P1", "x")
     problem = refused(tmp_path, "id,folder\nP1,\nP2,x\np1,x\nP1,x\n", "E-LST-05 ")
     assert problem.endswith('line 2 and line 4 ("p1"), line 2 and line 5 ("P1").')
 
 
+@pytest.mark.fault("I05")
 @pytest.mark.parametrize("folder", ["absent", "list.csv", "list.csv/x", "loop", "x" * 300])
 def test_folders_that_are_not_there(tmp_path: Path, folder: str) -> None:
     folders(tmp_path, "P1")
@@ -165,6 +171,7 @@ def test_folders_that_are_not_there(tmp_path: Path, folder: str) -> None:
     assert problem.endswith('line 3 ("P2").')
 
 
+@pytest.mark.fault("I05")
 def test_one_folder_under_two_ids(tmp_path: Path) -> None:
     folders(tmp_path, "P1", "P3")
     (tmp_path / "link").symlink_to("P1")
@@ -172,6 +179,7 @@ def test_one_folder_under_two_ids(tmp_path: Path) -> None:
     assert problem.endswith('line 2 ("P1") and line 4 ("P2").')
 
 
+@pytest.mark.fault("I05")
 @pytest.mark.parametrize(
     ("content", "why"),
     [
@@ -185,6 +193,7 @@ def test_what_is_no_text(tmp_path: Path, content: bytes, why: str) -> None:
     assert "ller" not in refused(tmp_path, content, f"E-LST-02 .*{why}")
 
 
+@pytest.mark.fault("I05")
 def test_a_list_that_is_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(case_list, "MAX_BYTES", 10)
     refused(tmp_path, "id\n12345678\n", "E-LST-02 .* has more than")
@@ -195,6 +204,7 @@ def test_a_list_without_the_names_of_its_columns(tmp_path: Path, header: str) ->
     refused(tmp_path, f"{header}\nP1,P1\n" if header else "", "E-LST-03 .* expected names of columns")
 
 
+@pytest.mark.fault("I05")
 @pytest.mark.parametrize(
     ("row", "why"),
     [

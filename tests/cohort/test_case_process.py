@@ -177,18 +177,21 @@ def test_the_last_words_count_where_there_is_no_record(bench: Bench) -> None:
 # what misbehaves: faults.md S17, in the order of its list, and more
 
 
+@pytest.mark.fault("S17")
 def test_segmentation_fault(bench: Bench) -> None:
     end = bench.run("segv")
     assert (end.word, end.code, end.transient) == ("ERROR", "E-JOB-04", False)
     assert "SIGSEGV" in end.problem
 
 
+@pytest.mark.fault("S17")
 def test_abort(bench: Bench) -> None:
     end = bench.run("abort")
     assert (end.code, end.transient) == ("E-JOB-04", False)
     assert "SIGABRT" in end.problem
 
 
+@pytest.mark.fault("S17")
 def test_one_that_hangs_ends_at_its_limit_of_time(bench: Bench) -> None:
     end = bench.limit(time_s=0.3).run("hangs")
     assert (end.word, end.code, end.transient) == ("ERROR", "E-JOB-01", False)
@@ -212,6 +215,7 @@ def test_the_signal_that_ended_it_is_told() -> None:
     assert (ended.over, ended.code, ended.output) == ("time", -signal.SIGTERM, "")
 
 
+@pytest.mark.fault("S17")
 def test_one_that_is_deaf_to_sigterm_is_killed(bench: Bench) -> None:
     end = bench.limit(time_s=1.0).run("deaf")
     assert end.code == "E-JOB-01"
@@ -219,6 +223,7 @@ def test_one_that_is_deaf_to_sigterm_is_killed(bench: Bench) -> None:
     assert are_gone(bench.pids())
 
 
+@pytest.mark.fault("S17")
 def test_what_it_started_counts_for_the_limit_of_memory(bench: Bench) -> None:
     end = bench.limit(memory_mb=150).run("memory")
     assert (end.word, end.code, end.transient) == ("ERROR", "E-JOB-02", False)
@@ -234,12 +239,14 @@ def test_one_that_goes_on_taking_memory_has_no_grace(bench: Bench, monkeypatch: 
     assert end.seconds < 10
 
 
+@pytest.mark.fault("S17")
 @pytest.mark.parametrize("name", ["systemexit", "exit0", "exit11", "exit70"])
 def test_an_exit_without_a_result(bench: Bench, name: str) -> None:
     end = bench.run(name)
     assert (end.word, end.code, end.transient) == ("ERROR", "E-JOB-05", False)
 
 
+@pytest.mark.fault("S17")
 def test_a_flood_of_output_is_read_and_its_end_kept(bench: Bench) -> None:
     end = bench.run("loud")
     assert (end.word, end.code) == ("ERROR", "E-CFG-01")
@@ -249,6 +256,7 @@ def test_a_flood_of_output_is_read_and_its_end_kept(bench: Bench) -> None:
     assert ended.output.endswith("xend\n")
 
 
+@pytest.mark.fault("S17")
 def test_nothing_of_a_bomb_survives(bench: Bench) -> None:
     end = bench.limit(time_s=2.5).run("bomb")
     assert end.code == "E-JOB-01"
@@ -256,6 +264,7 @@ def test_nothing_of_a_bomb_survives(bench: Bench) -> None:
     assert are_gone(bench.pids())
 
 
+@pytest.mark.fault("S17")
 def test_zombies_are_no_obstacle_and_none_is_left(bench: Bench) -> None:
     assert bench.will_leave(replace(PASS, case_id="zombies")).run("zombies").word == "PASS"
     assert zombie_children() == []
@@ -375,6 +384,7 @@ def supervised(bench: Bench, name: str) -> tuple[subprocess.Popen[bytes], list[i
     return process, pids
 
 
+@pytest.mark.fault("S03")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_stops_the_case_first(bench: Bench, number: signal.Signals) -> None:
     process, pids = supervised(bench, "hangs")
@@ -396,6 +406,7 @@ def test_a_second_interrupt_ends_the_grace(bench: Bench) -> None:
     assert are_gone(pids)
 
 
+@pytest.mark.fault("S16")
 def test_no_case_survives_the_death_of_the_one_that_watches_it(bench: Bench) -> None:
     process, pids = supervised(bench, "deaf")
     process.kill()

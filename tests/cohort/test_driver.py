@@ -146,6 +146,7 @@ def test_a_batch_that_fails_is_named_and_stops_no_other_and_memory_is_shared(
     assert sorted(path.stem for path in place.done("any").parent.iterdir()) == ["b2", "b3"]
 
 
+@pytest.mark.fault("S03")
 @with_engine
 def test_an_interrupt_ends_the_engine_and_its_jobs(
     place: CohortPlace, driving: Callable[[], subprocess.Popen[bytes]]
@@ -168,6 +169,7 @@ def test_an_interrupt_ends_the_engine_and_its_jobs(
     assert not is_driven(place)
 
 
+@pytest.mark.fault("S16")
 @with_engine
 @pytest.mark.parametrize("killed", ["wrapper", "wrapper and engine", "everything"])
 def test_after_a_kill_the_next_driver_brings_every_case_to_its_end_once(
