@@ -20,7 +20,7 @@ from pipeline.cohort.model import CaseEnd, ListedCase, Plan
 from pipeline.cohort.place import CohortPlace
 from pipeline.engine.lock import hold
 from pipeline.engine.storage_faults import storage
-from pipeline.engine.store import make_folder, replace_file
+from pipeline.engine.store import make_folder, replace_file, sweep
 from pipeline.errors import EnvironmentFault
 
 #: So many cases in a row that end in the same fault of the machine stop the batch: the next would fare no better.
@@ -61,7 +61,9 @@ def run_batch(batch: Batch) -> tuple[CaseEnd, ...]:
     with storage("Beginning the batch"):
         make_folder(batch.place.ledger(batch.name).parent)
         make_folder(batch.place.done(batch.name).parent)
+    done = batch.place.done(batch.name)
     with hold(batch.place.batch_lock(batch.name), wait=True):
+        sweep(done.parent, done.name)
         ends = _run_all(batch, plan, cases)
         faults = [end for end in ends if end.transient]
         if faults:
@@ -69,7 +71,7 @@ def run_batch(batch: Batch) -> tuple[CaseEnd, ...]:
         if load_batch(batch.place, batch.name) != cases:  # this one outlived its engine, and a new plan was made
             problem = f"The list of {batch.name} changed while it was at work."
             raise EnvironmentFault("E-BAT-03", problem, "Nothing is to be done: the batch is tried again.")
-        replace_file(batch.place.done(batch.name), _rows(ends))
+        replace_file(done, _rows(ends))
     return tuple(ends)
 
 

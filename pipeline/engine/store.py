@@ -201,10 +201,16 @@ def set_aside(folder: Path) -> None:
         folder.rename(folder.with_name(f".quarantine-{folder.name}-{secrets.token_hex(4)}"))
 
 
-def sweep(root: Path) -> None:
+def sweep(root: Path, name: str = "") -> None:
     """Clear away what earlier, killed runs left in a case's results; nothing whose name is not ours is touched.
 
     A result that was moved away for its successor, which then never came, is put back.
+
+    Parameters
+    ----------
+    root : Path
+    name : str
+        Only what was left of this file or folder, where others at work write beside it.
 
     Raises
     ------
@@ -213,6 +219,8 @@ def sweep(root: Path) -> None:
     with storage("Cleaning the results folder"):
         for path in sorted(root.iterdir()):
             leftover = _LEFTOVER.fullmatch(path.name)
+            if leftover and name not in ("", leftover["name"]):
+                continue
             if leftover and leftover["kind"] == "old" and not (root / leftover["name"]).exists():
                 path.rename(root / leftover["name"])
             elif leftover:

@@ -157,6 +157,16 @@ def test_a_batch_whose_list_changed_meanwhile_is_not_done(
     assert not place.done(NAME).exists()
 
 
+def test_what_a_killed_run_left_of_its_result_goes_and_nothing_of_others(place: CohortPlace, play: Play) -> None:
+    play({})
+    done = place.done(NAME)
+    left, other = (done.with_name(f".{name}.partial-{'0' * 32}") for name in (done.name, "bucket-0001.csv"))
+    left.touch()
+    other.touch()
+    run_batch(Batch(place, NAME, ("ct2lut",)))
+    assert sorted(path.name for path in done.parent.iterdir()) == sorted([done.name, other.name])
+
+
 def test_a_batch_that_is_not_there(place: CohortPlace, play: Play) -> None:
     play({})
     with pytest.raises(ConfigError, match="E-PLN"):
