@@ -307,7 +307,7 @@ def doctor(
 
 
 def _engine() -> Answer:
-    from pipeline.cohort.driver import engine_answer  # a library that is missing is an answer, too
+    from pipeline.cohort.doctor_engine import engine_answer  # a library that is missing is an answer, too
 
     return engine_answer()
 

@@ -49,6 +49,7 @@ def cohort(
         str, typer.Option("--program", help="What a job types for ct2lut, such as 'apptainer exec ct2lut.sif ct2lut'.")
     ] = "",
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Try cases again that have failed.")] = False,
+    plan_only: Annotated[bool, typer.Option("--plan-only", help="Lay out the batches for another engine.")] = False,
 ) -> int:
     """Process many cases, on this machine or on a cluster.
 
@@ -64,6 +65,8 @@ def cohort(
     limits = CaseLimits(memory_mb, 60.0 * minutes)
     request = CohortRequest(str(cases.resolve()), _absolute(protocol), tuple(overrides or ()), jobs, limits)
     order = Order(request, at_once, batch_size, _absolute(profile), program)
+    if plan_only:
+        return _plan_cohort(order, results, retry_failed=retry_failed)
     return _run_cohort(order, results, retry_failed=retry_failed)
 
 
@@ -222,6 +225,17 @@ def overview(
 def _absolute(name: str) -> str:
     """A name as it is, a path so that it means the same elsewhere."""
     return str(Path(name).resolve()) if "/" in name or name.endswith(".yaml") else name
+
+
+def _plan_cohort(order: Order, results: Path, *, retry_failed: bool) -> int:
+    from pipeline.cohort.place import CohortPlace
+    from pipeline.cohort.start import plan_cohort
+
+    place = CohortPlace(results.resolve())
+    plan = plan_cohort(order, place, shared.flow(), retry_failed=retry_failed)
+    cases = sum(map(len, plan.batches.values()))
+    say(f"{cases} cases in {len(plan.batches)} batches", f"lists: {place.case_list('any').parent}")
+    return ExitCode.PASS
 
 
 def _run_cohort(order: Order, results: Path, *, retry_failed: bool) -> int:

@@ -7,6 +7,7 @@ but by no job: it is free as soon as neither lives, however they ended.
 from __future__ import annotations
 
 import fcntl
+import getpass
 import json
 import os
 import re
@@ -15,7 +16,6 @@ import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -28,7 +28,6 @@ import yaml
 
 import pipeline
 from pipeline.cohort.place import CohortPlace
-from pipeline.commands.doctor_answer import Answer, State
 from pipeline.commands.doctor_machine import total_memory, usable_processors
 from pipeline.engine.runlog import printable
 from pipeline.engine.storage_faults import storage
@@ -40,8 +39,6 @@ from pipeline.suggestions import did_you_mean, listed, shown
 PROGRAM_VARIABLE = "CT2LUT_SNAKEMAKE"
 #: How often the caller is told that time has passed.
 TICK_S = 1.0
-#: The engine needs seconds to say its version; one that needs this long hangs.
-ANSWER_S = 120.0
 #: How long jobs of this machine, and a cluster that is asked to cancel its jobs, may take to end.
 LOCAL_PATIENCE_S, CLUSTER_PATIENCE_S = 15.0, 75.0
 #: The log of one run does not grow beyond this; the part before is kept once.
@@ -178,37 +175,6 @@ def wait_for_driver(place: CohortPlace, tick: Tick) -> None:
         time.sleep(TICK_S)
 
 
-def engine_answer() -> Answer:
-    """What the doctor says of the engine: its version and whose it is. None is well: a single case needs none."""
-    try:
-        program = _find_program()
-    except EnvironmentFault as fault:
-        if os.environ.get(PROGRAM_VARIABLE):
-            return Answer(fault.problem, State.LOOK, fault.action)
-        return Answer("not installed; a single case does not need it (make setup-cohort)")
-    folder = program.parent.parent.name
-    place = folder if folder.endswith("-cohort") else "your own"
-    said = _asked_for_version(program)
-    if re.fullmatch(r"\d+(\.\w+)+", said):
-        return Answer(f"snakemake {said} ({place})")
-    action = f"Type: rm -r .venv-cohort; make setup-cohort. Or name another: export {PROGRAM_VARIABLE}=FILE"
-    return Answer(f"snakemake ({place}) is there and does not work: {said}", State.LOOK, action)
-
-
-def _asked_for_version(program: Path) -> str:
-    """What it answers, or how it failed; without a home it would leave its caches where it stands."""
-    with tempfile.TemporaryDirectory(prefix="ct2lut-doctor-") as own:
-        env = os.environ | {"HOME": own, "XDG_CACHE_HOME": own}
-        command = (str(program), "--version")
-        try:
-            done = subprocess.run(command, env=env, cwd=own, capture_output=True, timeout=ANSWER_S, check=False)  # noqa: S603 -- as below
-        except subprocess.TimeoutExpired:
-            return f"no answer after {ANSWER_S:g} s"
-        except OSError as error:
-            return f"it cannot be started ({type(error).__name__})"
-    return done.stdout[:40].decode("utf-8", "replace").strip() if done.returncode == 0 else f"exit {done.returncode}"
-
-
 def _find_program() -> Path:
     named = os.environ.get(PROGRAM_VARIABLE)
     if named:
@@ -283,7 +249,16 @@ def _environment(place: CohortPlace) -> Mapping[str, str]:
     own = str((place.files / "engine.cache").absolute())
     home = os.environ.get("HOME", "")
     usable = home and os.access(home, os.W_OK | os.X_OK)
-    return {**os.environ, "XDG_CACHE_HOME": own, "HOME": home if usable else own}
+    return {**_user(), **os.environ, "XDG_CACHE_HOME": own, "HOME": home if usable else own}
+
+
+def _user() -> Mapping[str, str]:
+    """A name where the user has none, as in a container: the engine asks for it and fails without one."""
+    try:
+        getpass.getuser()
+    except (KeyError, OSError):  # the first until Python 3.12
+        return {"LOGNAME": str(os.getuid())}
+    return {}
 
 
 @dataclass(frozen=True)

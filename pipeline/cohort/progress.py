@@ -257,6 +257,7 @@ class Reporter:
         self._watcher, self._clock = Watcher(place, plan, clock), clock
         self._write, self._terminal = write, terminal
         self._next = self._next_line = -math.inf
+        self._told = ""
 
     def tick(self) -> None:
         """Look and tell, if it is time; to be called about once a second."""
@@ -276,9 +277,9 @@ class Reporter:
         line = progress_line(progress)
         if self._terminal:
             self._write(f"{_WIPE}{line}\n" if last else f"{_WIPE}{line[: shutil.get_terminal_size().columns - 1]}")
-        elif last or self._clock() >= self._next_line:
+        elif line != self._told and (last or self._clock() >= self._next_line):
             self._write(f"{line}\n")
-            self._next_line = self._clock() + LINE_S
+            self._next_line, self._told = self._clock() + LINE_S, line
 
 
 def _keys(place: CohortPlace, plan: Plan, name: str) -> dict[str, str]:

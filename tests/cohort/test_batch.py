@@ -161,6 +161,7 @@ def test_what_a_killed_run_left_of_its_result_goes_and_nothing_of_others(place: 
     play({})
     done = place.done(NAME)
     left, other = (done.with_name(f".{name}.partial-{'0' * 32}") for name in (done.name, "bucket-0001.csv"))
+    done.parent.mkdir(parents=True, exist_ok=True)
     left.touch()
     other.touch()
     run_batch(Batch(place, NAME, ("ct2lut",)))

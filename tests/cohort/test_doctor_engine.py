@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 import pipeline
-from pipeline.cohort import driver
-from pipeline.cohort.driver import PROGRAM_VARIABLE, engine_answer
+from pipeline.cohort import doctor_engine
+from pipeline.cohort.doctor_engine import engine_answer
+from pipeline.cohort.driver import PROGRAM_VARIABLE, find_engine
 from pipeline.commands.doctor_answer import Answer, State
 
 Patch = pytest.MonkeyPatch
@@ -47,7 +48,7 @@ def test_without_an_engine_a_single_case_is_well(machine: Path) -> None:
 def test_the_engine_is_found_where_a_cohort_finds_it(machine: Path, environment: str, place: str) -> None:
     program = engine(machine / environment, '#!/bin/sh\n[ "$*" = --version ] && echo 9.27.1\n')
     assert engine_answer() == Answer(f"snakemake 9.27.1 ({place})")
-    assert driver.find_engine("workstation", 0).snakemake == program
+    assert find_engine("workstation", 0).snakemake == program
 
 
 def test_the_one_that_is_named_comes_first(machine: Path, monkeypatch: Patch) -> None:
@@ -77,7 +78,7 @@ def test_a_name_without_a_program_is_worth_a_look(machine: Path, monkeypatch: Pa
 )
 def test_one_that_does_not_work_is_worth_a_look(machine: Path, monkeypatch: Patch, script: str, how: str) -> None:
     engine(machine / "checkout" / ".venv-cohort", script)
-    monkeypatch.setattr(driver, "ANSWER_S", 1.0)
+    monkeypatch.setattr(doctor_engine, "ANSWER_S", 1.0)
     begun = time.monotonic()
     answer = engine_answer()
     assert time.monotonic() - begun < 30
@@ -101,7 +102,7 @@ def test_it_leaves_no_cache_where_the_user_stands(machine: Path, monkeypatch: Pa
 
 
 def test_the_engine_itself_says_its_version() -> None:
-    if driver.PROGRAM_VARIABLE in os.environ or not (Path(pipeline.__file__).parents[1] / ".venv-cohort").is_dir():
+    if PROGRAM_VARIABLE in os.environ or not (Path(pipeline.__file__).parents[1] / ".venv-cohort").is_dir():
         pytest.skip("the engine is not installed (make setup-cohort)")
     answer = engine_answer()
     assert answer.state is State.OK

