@@ -129,7 +129,7 @@ fuzz: setup-dev  ## mutate scanner files more than a hundred times as often as t
 
 test-cohort: setup-dev setup-cohort  ## 200 phantom cases, 20 of them broken, killed three times on the way (an hour, 8 GB)
 	@rm -rf build/test-cohort
-	@$(BIN)/python -P -m tests.cohort.real --cases 200 --broken 20 --kills 3 --most-overhead 5 --work build/test-cohort
+	@$(BIN)/python -m tests.cohort.real --cases 200 --broken 20 --kills 3 --most-overhead 5 --work build/test-cohort
 
 test-browser: setup-dev  ## try every page in Chromium (skips without one)
 	@$(BIN)/python -P -m pytest tests/players -rs

@@ -305,13 +305,13 @@ def test_a_doctor_for_people_and_for_monitoring(ct2lut: Run, monkeypatch: pytest
     code, out, err = ct2lut("doctor", "--results", "results")
     assert (code, err) == (ExitCode.PASS, "")
     assert [line.split()[:2] for line in out.splitlines()[:-1]] == [
-        [n, "ok"] for n in ("disk", "results", "locks", "clock")
+        [n, "ok"] for n in ("cohorts", "disk", "results", "locks", "clock")
     ]
     assert out.splitlines()[-1] == "This machine is ready."
     code, out, err = ct2lut("doctor", "--results", "cases/P001/case.yaml", "--json")
     told = json.loads(out)
     assert (code, err, told["ok"]) == (ExitCode.ENVIRONMENT, "", False)
-    assert told["checks"][1]["found"] == "cases/P001/case.yaml is not a folder"
+    assert told["checks"][2]["found"] == "cases/P001/case.yaml is not a folder"
     assert listing(Path()) == before
 
 

@@ -212,12 +212,17 @@ def overview(
 ) -> None:
     """Write one page of all cases: pictures, verdict, numbers, what is unusual.
 
-    Only what changed since the last time is read again.
+    Only what changed since the last time is read again. After a cohort its table, cohort.csv, is written too.
 
     Example: ct2lut overview --results results
     """
+    from pipeline.cohort.place import CohortPlace
+    from pipeline.cohort.summary import bring_up_to_date, summary_lines
     from pipeline.commands.cohort_index import Places, overview_lines, write_overview
 
+    if out is None and (summary := bring_up_to_date(CohortPlace(results), shared.flow())):
+        say(*summary_lines(summary))
+        return
     page = out or results / "index.html"
     say(*overview_lines(write_overview(Places(results, page), shared.flow()), page))
 

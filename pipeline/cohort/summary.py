@@ -200,6 +200,17 @@ def worst(words: Iterable[str], *, unfinished: bool) -> ExitCode:
     return ExitCode.REVIEW if "REVIEW" in found else ExitCode.PASS
 
 
+def bring_up_to_date(place: CohortPlace, flow: Sequence[Stage]) -> Summary | None:
+    """Write the summary and the overview of the last cohort of a results folder; None where there was none.
+
+    Raises
+    ------
+    ConfigError, EnvironmentFault
+        As :func:`write_summary`.
+    """
+    return write_summary(place, load_plan(place), flow) if place.plan.exists() else None
+
+
 def summary_csv(cases: Sequence[CaseSummary]) -> bytes:
     """The table of all cases: a line of column names, one line a case."""
     out = io.StringIO(newline="")

@@ -238,6 +238,18 @@ def test_what_the_engine_is_told(place: CohortPlace, monkeypatch: pytest.MonkeyP
     assert home == str(place.results)
 
 
+@pytest.mark.parametrize(("names", "told"), [({os.getuid(): ["me"]}, "none"), ({}, str(os.getuid()))])
+def test_a_user_without_a_name_is_given_one(
+    place: CohortPlace, monkeypatch: pytest.MonkeyPatch, names: dict[int, list[str]], told: str
+) -> None:
+    """As any user of a container; the engine asks for it and would end with a KeyError."""
+    for variable in ("LOGNAME", "USER", "LNAME", "USERNAME"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr("pwd.getpwuid", names.__getitem__)
+    run_engine(place, in_place_of_it(place, 'echo "${LOGNAME-none}"'), nothing)
+    assert place.engine_log.read_text() == f"{told}\n"
+
+
 def test_what_the_engine_says_is_kept_within_limits(place: CohortPlace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver, "LOG_BYTES", 1000)
     monkeypatch.setattr(driver, "TICK_S", 0.05)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -12,8 +14,11 @@ from pipeline.cohort.ledger import Ledger, events
 from pipeline.cohort.model import CaseEnd, CohortRequest, ListedCase
 from pipeline.cohort.place import CohortPlace
 from pipeline.cohort.serving import server
+from pipeline.commands.cohort_index import Places
+from pipeline.engine.stage import Stage
 from pipeline.engine.store import make_folder
 from pipeline.errors import EnvironmentFault
+from tests.cohort.cohort_sample import planned
 from tests.toy_flow import TOY_FLOW
 
 END = CaseEnd("P1", "REJECTED", "E-IO-03", "It holds no files.", "Put some there.", 1.0)
@@ -48,3 +53,28 @@ def test_a_history_that_cannot_be_written_is_a_fault_of_the_machine(work: CaseWo
     (work.results / "cohort.files").write_text("in the way")
     with pytest.raises(EnvironmentFault, match="Beginning a case failed"):
         server(work, TOY_FLOW)(ListedCase("P1", tmp_path / "cases" / "P1"))
+
+
+def test_where_the_overview_takes_long_it_is_not_written_after_each_case(
+    work: CaseWork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [0.0]
+    written: list[float] = []
+
+    def write_overview(places: Places, flow: Sequence[Stage]) -> None:
+        written.append(clock[0])
+        clock[0] += 10.0
+
+    monkeypatch.setattr(serving, "write_overview", write_overview)
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    run = server(work, TOY_FLOW)
+    for _ in range(5):
+        run(ListedCase("P1", tmp_path / "cases" / "P1"))
+        clock[0] += 90.0
+    assert written == [0.0, 280.0]
+
+
+def test_the_overview_of_a_cohort_keeps_the_cases_without_results(work: CaseWork, tmp_path: Path) -> None:
+    planned(tmp_path, ["P1", "P2"])
+    server(work, TOY_FLOW)(ListedCase("P1", tmp_path / "cases" / "P1"))
+    assert "NOT STARTED" in (work.results / "index.html").read_text()
