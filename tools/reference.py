@@ -6,6 +6,7 @@ python -m tools.reference docs
 from __future__ import annotations
 
 import ast
+import itertools
 import re
 import sys
 from collections import defaultdict
@@ -38,6 +39,7 @@ NOTE = "<!-- written by `make docs` from the code; do not edit -->"
 SUMMARIES = {
     "E-CFG-01": "A stage or setting of that name does not exist (protocol, joint file or `--set`).",
     "E-CFG-02": "A setting has a value that it cannot have (protocol, joint file or `--set`).",
+    "E-BAT-02": "No result yet of …, because the machine was at fault: … …",
     "E-GEO-06": "The voxel size of … is outside the range for which results are trusted.",
     "E-BUG-01": "The program failed: … Please report this line and the command you typed.",
     "E-ENV-20": "The operating system refused: … Check the folders you named, their permissions and the disk.",
@@ -200,22 +202,36 @@ def _messages(tree: ast.Module) -> Iterator[tuple[str, str]]:
     constants = [node for node in tree.body if isinstance(node, ast.Assign)]
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
     for scope in (*constants, *functions):
-        assigned = [node for node in ast.walk(scope) if isinstance(node, ast.Assign)]
         for call in (node for node in ast.walk(scope) if isinstance(node, ast.Call)):
-            yield from _message(call, [node for node in assigned if node.lineno < call.lineno])
+            yield from _message(call, scope)
     for node in ast.walk(tree):
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and CODE.fullmatch(node.value):
             yield node.value, ""
 
 
-def _message(call: ast.Call, assigned: list[ast.Assign]) -> Iterator[tuple[str, str]]:
-    """The texts beside a code in a call; a name stands for what was last assigned to it above the call."""
+def _message(call: ast.Call, scope: ast.stmt) -> Iterator[tuple[str, str]]:
+    """The texts beside a code in a call; a name stands for each value that it may have there."""
     values = [*call.args, *(keyword.value for keyword in call.keywords)]
     codes = [value.value for value in values if isinstance(value, ast.Constant) and CODE.fullmatch(str(value.value))]
-    local = {node.targets[0].id: node.value for node in assigned if isinstance(node.targets[0], ast.Name)}
-    texts = [_template(local.get(value.id, value) if isinstance(value, ast.Name) else value) for value in values]
-    for code in codes:
-        yield str(code), " ".join(text for text in texts if " " in text)
+    if not codes:
+        return
+    choices = [_choices(value, call, scope) if isinstance(value, ast.Name) else [value] for value in values]
+    for chosen in itertools.product(*choices):
+        texts = [_template(value) for value in chosen]
+        yield from ((str(code), " ".join(text for text in texts if " " in text)) for code in codes)
+
+
+def _choices(name: ast.Name, call: ast.Call, scope: ast.stmt) -> list[ast.expr]:
+    """What was last assigned to a name above a call; on each branch, where that is below an ``if`` that ended there."""
+    above = [node for node in ast.walk(scope) if isinstance(node, ast.Assign) and node.lineno < call.lineno]
+    named = [node for node in above if isinstance(node.targets[0], ast.Name) and node.targets[0].id == name.id]
+    if not named:
+        return [name]
+    last = max(named, key=lambda node: node.lineno)
+    ended = [node for node in ast.walk(scope) if isinstance(node, ast.If) and (node.end_lineno or 0) < call.lineno]
+    around = [node for node in ended if last in ast.walk(node)]
+    branches = list(ast.walk(min(around, key=lambda node: node.lineno))) if around else [last]
+    return [node.value for node in named if node in branches]
 
 
 def _template(value: ast.expr) -> str:

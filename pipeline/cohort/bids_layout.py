@@ -329,8 +329,8 @@ def _refuse_unknown(what: str, asked: tuple[str, ...], known: list[str]) -> None
     if not unknown:
         return
     more = f" and {len(known) - LISTED} more" if len(known) > LISTED else ""
-    problem = f"The dataset has no {what} {listed(unknown[:LISTED])}{did_you_mean(unknown[0], known)}; it has "
-    raise ConfigError("E-BID-03", f"{problem}{listed(known[:LISTED])}{more}.", "Correct the label.")
+    absent, there = f"{listed(unknown[:LISTED])}{did_you_mean(unknown[0], known)}", f"{listed(known[:LISTED])}{more}"
+    raise ConfigError("E-BID-03", f"The dataset has no {what} {absent}; it has {there}.", "Correct the label.")
 
 
 def _refuse_ids(cases: tuple[BidsCase, ...]) -> None:
