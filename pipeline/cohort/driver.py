@@ -6,21 +6,18 @@ but by no job: it is free as soon as neither lives, however they ended.
 
 from __future__ import annotations
 
-import fcntl
 import getpass
 import json
 import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
 
@@ -29,6 +26,7 @@ import yaml
 import pipeline
 from pipeline.cohort.place import CohortPlace
 from pipeline.commands.doctor_machine import total_memory, usable_processors
+from pipeline.engine.lock import Held, Lock, hold, is_held
 from pipeline.engine.runlog import printable
 from pipeline.engine.storage_faults import storage
 from pipeline.engine.store import make_folder, open_or_create, read_file
@@ -145,7 +143,7 @@ def run_engine(place: CohortPlace, engine: Engine, tick: Tick) -> EngineEnd:
         with storage("Opening the engine's log"):
             log = open_or_create(place.engine_log, os.O_WRONLY | os.O_APPEND)
         try:
-            code = _follow(_Start(command, _environment(place), log, lock.descriptor), profile, _capped(place, tick))
+            code = _follow(_Start(command, _environment(place), log, lock), profile, _capped(place, tick))
         finally:
             os.close(log)
     return EngineEnd(code == 0, "" if code == 0 else _said(place, code))
@@ -153,19 +151,7 @@ def run_engine(place: CohortPlace, engine: Engine, tick: Tick) -> EngineEnd:
 
 def is_driven(place: CohortPlace) -> bool:
     """Whether a driver or its engine is at work on this results folder; changes nothing."""
-    try:
-        descriptor = os.open(place.lock, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    finally:
-        os.close(descriptor)
-    return False
+    return is_held(place.lock)
 
 
 def wait_for_driver(place: CohortPlace, tick: Tick) -> None:
@@ -261,52 +247,19 @@ def _user() -> Mapping[str, str]:
     return {}
 
 
-@dataclass(frozen=True)
-class _Lock:
-    """``sure`` is False where the file system has no locks."""
-
-    descriptor: int
-    sure: bool
-
-
 @contextmanager
-def _driver_lock(place: CohortPlace) -> Iterator[_Lock]:
+def _driver_lock(place: CohortPlace) -> Iterator[Lock]:
     with storage("Opening the lock of the cohort"):
         make_folder(place.files)
-        descriptor = open_or_create(place.lock, os.O_RDWR)
     try:
-        lock = _Lock(descriptor, _acquire(descriptor))
-        _sign(descriptor)
-        yield lock
-    finally:
-        os.close(descriptor)
+        with hold(place.lock, "the lock of the cohort") as lock:
+            yield lock
+    except Held as held:
+        problem = f"Another driver is at work on these results {held.holder}."
+        raise EnvironmentFault("E-ENG-02", problem, "Wait until it ends, or stop it; nothing was changed.") from held
 
 
-def _acquire(descriptor: int) -> bool:
-    for _ in range(5):  # whoever only looks holds it for a moment
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            time.sleep(0.1)
-        except OSError:
-            return False
-        else:
-            return True
-    holder = printable(os.pread(descriptor, 300, 0).decode("utf-8", "replace").strip())
-    problem = f"Another driver is at work on these results {holder or 'since a moment ago'}."
-    raise EnvironmentFault("E-ENG-02", problem, "Wait until it ends, or stop it; nothing was changed.")
-
-
-def _sign(descriptor: int, engine: int | None = None) -> None:
-    """Say who holds the lock, where the disk still takes it."""
-    started = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-    processes = f"pid {os.getpid()}" + (f", engine {engine}" if engine else "")
-    with suppress(OSError):
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"since {started} on {socket.gethostname()} ({processes})\n".encode(), 0)
-
-
-def _tidy(place: CohortPlace, lock: _Lock) -> None:
+def _tidy(place: CohortPlace, lock: Lock) -> None:
     """Clear away what killed engines left, and the oldest logs."""
     own = place.workflow / ".snakemake"
     left = own / "locks"
@@ -345,7 +298,7 @@ class _Start:
     command: Sequence[str]
     environment: Mapping[str, str]
     log: int
-    lock: int
+    lock: Lock
 
 
 def _follow(start: _Start, profile: _Profile, tick: Tick) -> int:
@@ -354,7 +307,7 @@ def _follow(start: _Start, profile: _Profile, tick: Tick) -> int:
         process = _popen(start)
         try:
             deliver()
-            _sign(start.lock, process.pid)
+            start.lock.sign(f", engine {process.pid}")
             while process.poll() is None:
                 with suppress(subprocess.TimeoutExpired):
                     process.wait(TICK_S)
@@ -373,7 +326,7 @@ def _popen(start: _Start) -> subprocess.Popen[bytes]:
             stdout=start.log,
             stderr=start.log,
             start_new_session=True,
-            pass_fds=(start.lock,),
+            pass_fds=(start.lock.descriptor,),
             umask=0o027,
         )
 

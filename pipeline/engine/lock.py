@@ -5,16 +5,24 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from pipeline.engine.runlog import printable
 from pipeline.engine.storage_faults import storage
 from pipeline.engine.store import make_folder, open_or_create
 from pipeline.errors import EnvironmentFault
 
 LOCK_FILE = ".lock"
+
+#: So often, and with such a pause, it is tried before somebody counts as its holder.
+_LOOKERS = 4
+_LOOKER_S = 0.1
 
 _NO_LOCKS_HERE = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL})
 _held: set[int] = set()
@@ -50,8 +58,8 @@ def case_lock(root: Path) -> Iterator[bool]:
     with storage(f"Opening {what}"):
         make_folder(root)
     try:
-        with hold(root / LOCK_FILE, what) as locked:
-            yield locked
+        with hold(root / LOCK_FILE, what) as lock:
+            yield lock.sure
     except Held as held:
         raise EnvironmentFault(
             "E-LOCK-01",
@@ -68,8 +76,31 @@ class Held(Exception):
         self.holder = holder
 
 
+@dataclass(frozen=True)
+class Lock:
+    """A lock that is held.
+
+    Attributes
+    ----------
+    descriptor : int
+        A process that inherits it holds the lock too.
+    sure : bool
+        False where the file system has no locks.
+    """
+
+    descriptor: int
+    sure: bool
+
+    def sign(self, more: str = "") -> None:
+        """Write into the file who holds it, for people."""
+        started = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        os.ftruncate(self.descriptor, 0)
+        text = f"since {started} on {socket.gethostname()} (pid {os.getpid()}{more})\n"
+        os.pwrite(self.descriptor, text.encode("utf-8", "replace"), 0)
+
+
 @contextmanager
-def hold(path: Path, what: str = "", *, wait: bool = False) -> Iterator[bool]:
+def hold(path: Path, what: str = "", *, wait: bool = False) -> Iterator[Lock]:
     """Hold the lock of a file that stays, in a folder that is there.
 
     Parameters
@@ -82,8 +113,7 @@ def hold(path: Path, what: str = "", *, wait: bool = False) -> Iterator[bool]:
 
     Yields
     ------
-    bool
-        False where the file system has no locks.
+    Lock
 
     Raises
     ------
@@ -97,8 +127,10 @@ def hold(path: Path, what: str = "", *, wait: bool = False) -> Iterator[bool]:
     _held.add(descriptor)
     try:
         with storage(f"Locking {what or path.name}"):
-            locked = _acquire(descriptor, wait=wait)
-        yield locked
+            lock = Lock(descriptor, _acquire(descriptor, wait=wait))
+            if lock.sure:
+                lock.sign()
+        yield lock
     finally:
         _held.discard(descriptor)
         os.close(descriptor)
@@ -106,8 +138,13 @@ def hold(path: Path, what: str = "", *, wait: bool = False) -> Iterator[bool]:
 
 def is_running(root: Path) -> bool:
     """Whether some run holds the lock of a case's results folder; changes nothing."""
+    return is_held(root / LOCK_FILE)
+
+
+def is_held(path: Path) -> bool:
+    """Whether somebody holds the lock of a file; changes nothing."""
     try:
-        descriptor = os.open(root / LOCK_FILE, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     except OSError:
         return False
     try:
@@ -122,16 +159,17 @@ def is_running(root: Path) -> bool:
 
 
 def _acquire(descriptor: int, *, wait: bool) -> bool:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except BlockingIOError as error:
-        holder = os.pread(descriptor, 100, 0).decode("ascii", "replace").strip()
-        raise Held(holder or "since a moment ago") from error
-    except OSError as error:
-        if error.errno in _NO_LOCKS_HERE:
-            return False
-        raise
-    started = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-    os.ftruncate(descriptor, 0)
-    os.pwrite(descriptor, f"since {started} (pid {os.getpid()})\n".encode(), 0)
-    return True
+    """Take the lock; False where the file system has none."""
+    for _ in range(_LOOKERS):
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            time.sleep(_LOOKER_S)  # whoever only looks holds it for a moment
+        except OSError as error:
+            if error.errno in _NO_LOCKS_HERE:
+                return False
+            raise
+        else:
+            return True
+    holder = printable(os.pread(descriptor, 300, 0).decode("utf-8", "replace").strip())
+    raise Held(holder or "since a moment ago")

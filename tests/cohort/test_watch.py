@@ -373,7 +373,7 @@ def test_an_interrupt_passes_through_and_the_case_is_run_by_the_next_watch(scene
 
 
 def test_one_watch_at_a_time(scene: Scene) -> None:
-    pattern = r"E-WCH-01 Another watch is at work on this results folder since .* UTC \(pid \d+\)\. Leave it to"
+    pattern = r"E-WCH-01 Another watch is at work on this results folder since .* UTC on \S+ \(pid \d+\)\. Leave it to"
     scene.play()
     with hold(scene.place.watch_lock), pytest.raises(EnvironmentFault, match=pattern):
         scene.play(nothing)

@@ -41,7 +41,7 @@ def test_a_second_run_of_a_case_is_refused_at_once_and_the_first_ends_well(job: 
     os.read(inside, 1)
     outcome, _ = run(job)
     assert (outcome.exit_code, outcome.code) == (ExitCode.ENVIRONMENT, "E-LOCK-01")
-    pattern = rf"Case P1 is already running since \d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d UTC \(pid {child}\)\."
+    pattern = rf"Case P1 is already running since \d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d UTC on \S+ \(pid {child}\)\."
     assert re.fullmatch(pattern, str(outcome.problem))
     os.write(let_go, b"x")
     assert wait(child) == 0
@@ -79,6 +79,23 @@ def test_the_lock_file_stays_and_holds_nothing_up(tmp_path: Path) -> None:
             assert is_running(tmp_path)
         assert not is_running(tmp_path)
     assert (tmp_path / ".lock").is_file()
+
+
+def test_somebody_who_only_looks_holds_nobody_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a cohort's progress does, many times while its cases begin."""
+    looks = [True, True]
+    flock = fcntl.flock
+
+    def busy(descriptor: int, operation: int) -> None:
+        if operation & fcntl.LOCK_EX and looks:
+            looks.pop()
+            raise BlockingIOError(errno.EWOULDBLOCK, "somebody looks")
+        flock(descriptor, operation)
+
+    monkeypatch.setattr(fcntl, "flock", busy)
+    with case_lock(tmp_path) as alone:
+        assert alone
+    assert looks == []
 
 
 @pytest.mark.parametrize("kind", ["link", "folder"])
