@@ -49,7 +49,7 @@ def execute(arguments: Sequence[str]) -> int:
 
 def _call(arguments: list[str]) -> int | None:
     if arguments[2:3] in (["participant"], ["group"]):
-        from pipeline.cohort.bids_call import is_bids_call
+        from pipeline.cohort.bids.call import is_bids_call
 
         if is_bids_call(arguments, typer.main.get_group(app).commands):
             return cohort.run_bids_app(arguments)

@@ -257,8 +257,8 @@ def _run_cohort(order: Order, results: Path, *, retry_failed: bool) -> int:
 
 def run_bids_app(arguments: Sequence[str]) -> int:
     """The call of a BIDS-App: ``IN OUT participant|group``."""
-    from pipeline.cohort.bids_app import run_participants, summarise_group
-    from pipeline.cohort.bids_call import bids_help, parse_bids_call
+    from pipeline.cohort.bids.app import run_participants, summarise_group
+    from pipeline.cohort.bids.call import bids_help, parse_bids_call
     from pipeline.cohort.case_process import program
     from pipeline.cohort.summary import summary_lines
 

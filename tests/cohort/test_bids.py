@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from pipeline.case_declaration import label_preset, read_declaration
-from pipeline.cohort import bids
-from pipeline.cohort.bids import prepare_case, write_dataset_files
-from pipeline.cohort.bids_call import BidsCall, bids_help, is_bids_call, parse_bids_call
-from pipeline.cohort.bids_labels import structure_name
-from pipeline.cohort.bids_layout import BidsCase, bids_cases
+from pipeline.cohort.bids import prepare as bids
+from pipeline.cohort.bids.call import BidsCall, bids_help, is_bids_call, parse_bids_call
+from pipeline.cohort.bids.labels import structure_name
+from pipeline.cohort.bids.layout import BidsCase, bids_cases
+from pipeline.cohort.bids.prepare import prepare_case, write_dataset_files
 from pipeline.engine.source import list_source
 from pipeline.errors import CaseRejected, ConfigError
 from pipeline.files.case_files import choose_files

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from pipeline import cli
-from pipeline.cohort import bids_app, case_process
-from pipeline.cohort.bids_app import run_participants, summarise_group
-from pipeline.cohort.bids_call import parse_bids_call
+from pipeline.cohort import case_process
+from pipeline.cohort.bids import app as bids_app
+from pipeline.cohort.bids.app import run_participants, summarise_group
+from pipeline.cohort.bids.call import parse_bids_call
 from pipeline.cohort.case_process import CaseWork
 from pipeline.cohort.ledger import Ledger
 from pipeline.cohort.model import CaseEnd, ListedCase

@@ -14,9 +14,9 @@ from typing import TypeVar
 
 from pipeline import __version__
 from pipeline.case_declaration import label_presets, parse_json
-from pipeline.cohort.bids_call import FILTERED
-from pipeline.cohort.bids_labels import labels_of_table, preset_of
-from pipeline.cohort.bids_layout import ENDINGS, BidsCase, BidsFile, inherited, parse_name, read_table
+from pipeline.cohort.bids.call import FILTERED
+from pipeline.cohort.bids.labels import labels_of_table, preset_of
+from pipeline.cohort.bids.layout import ENDINGS, BidsCase, BidsFile, inherited, parse_name, read_table
 from pipeline.cohort.model import ListedCase
 from pipeline.engine.runlog import printable
 from pipeline.engine.storage_faults import storage

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 
 from pipeline.cohort.batch import refuse_full_disk, run_listed
 from pipeline.cohort.batches import PlanInputs, source_signature, write_plan
-from pipeline.cohort.bids import CASES_FOLDER, prepare_case, write_dataset_files
-from pipeline.cohort.bids_call import BidsCall
-from pipeline.cohort.bids_layout import BidsCase, bids_cases
+from pipeline.cohort.bids.call import BidsCall
+from pipeline.cohort.bids.layout import BidsCase, bids_cases
+from pipeline.cohort.bids.prepare import CASES_FOLDER, prepare_case, write_dataset_files
 from pipeline.cohort.case_process import CaseWork
 from pipeline.cohort.ledger import Ledger, event_key
 from pipeline.cohort.model import CaseEnd, CaseLimits, CohortRequest, ListedCase

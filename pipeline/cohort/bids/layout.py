@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from pipeline.case_id import is_case_id
-from pipeline.cohort.bids_call import LABEL, PIPELINE, BidsCall, Filter
+from pipeline.cohort.bids.call import LABEL, PIPELINE, BidsCall, Filter
 from pipeline.engine.storage_faults import storage
 from pipeline.errors import ConfigError
 from pipeline.suggestions import did_you_mean, listed, shown
@@ -110,8 +110,8 @@ class _Dataset:
 def bids_cases(call: BidsCall) -> tuple[BidsCase, ...]:
     """The cases of a dataset, or of the subjects and sessions that the call names.
 
-    A subject or session without CT and segmentation is a case too: :func:`pipeline.cohort.bids.prepare_case` refuses
-    it in words.
+    A subject or session without CT and segmentation is a case too:
+    :func:`pipeline.cohort.bids.prepare.prepare_case` refuses it in words.
 
     Raises
     ------
