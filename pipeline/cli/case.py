@@ -111,10 +111,12 @@ def status(
 ) -> None:
     """Show how far a case has got.
 
-    With ID one line for each stage, without it one line for each case.
+    With ID one line for each stage, without it one line for each case, and how far the last cohort is.
 
     Example: ct2lut status P001
     """
+    from pipeline.cohort.place import CohortPlace
+    from pipeline.cohort.progress import cohort_line
     from pipeline.commands.review import ReviewedCase, review_line
     from pipeline.commands.summary import overview_line, status_lines
     from pipeline.engine.runner import read_status
@@ -128,6 +130,8 @@ def status(
     say(*(overview_line(path.name, read_status(path, flow)) for path in folders if is_case_id(path.name)))
     if not folders:
         say(f"no results in {results}")
+    if line := cohort_line(CohortPlace(results)):
+        say(line)
 
 
 @app.command()

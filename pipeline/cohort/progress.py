@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import fmean
 
-from pipeline.cohort.batches import load_batch
+from pipeline.cohort.batches import load_batch, load_plan
 from pipeline.cohort.ledger import Event, event_key, events
 from pipeline.cohort.model import CaseEnd, Plan
 from pipeline.cohort.place import CohortPlace
@@ -203,6 +203,19 @@ def progress_line(progress: Progress) -> str:
     head = f"{progress.done} of {progress.total} done" + (f" ({told})" if told else "")
     left = "" if progress.left_s is None else f"about {_duration(progress.left_s)} left"
     return printable(", ".join(filter(None, [head, _running(progress.running), left])))
+
+
+def cohort_line(place: CohortPlace) -> str | None:
+    """How far the last cohort of a results folder is; None where there was none.
+
+    Raises
+    ------
+    ConfigError, EnvironmentFault
+        When its plan cannot be read.
+    """
+    if not place.plan.exists():
+        return None
+    return f"cohort: {progress_line(Watcher(place, load_plan(place), time.monotonic).look())}"
 
 
 def ended_line(end: CaseEnd, progress: Progress) -> str:

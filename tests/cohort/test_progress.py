@@ -10,7 +10,8 @@ import pytest
 
 from pipeline.cohort import progress
 from pipeline.cohort.model import CaseEnd
-from pipeline.cohort.progress import Progress, Reporter, Watcher, ended_line, ended_lines, progress_line
+from pipeline.cohort.place import CohortPlace
+from pipeline.cohort.progress import Progress, Reporter, Watcher, cohort_line, ended_line, ended_lines, progress_line
 from pipeline.engine.lock import case_lock
 from tests.cohort.cohort_sample import REFUSED, Batches, lost, planned, refused
 
@@ -291,3 +292,10 @@ def test_looking_takes_no_more_than_its_share(cohort: Cohort, monkeypatch: pytes
         plain.tick()
         cohort.clock.now += 1.0
     assert looks == [100.0, 142.0, 184.0]
+
+
+def test_status_tells_how_far_a_cohort_is(tmp_path: Path) -> None:
+    assert cohort_line(CohortPlace(tmp_path / "results")) is None
+    place, plan = planned(tmp_path, ["P1", "P2", "P3"])
+    Batches(place, plan).run(refused("P1"))
+    assert cohort_line(place) == "cohort: 1 of 3 done (1 failed)"
