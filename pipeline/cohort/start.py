@@ -84,7 +84,9 @@ def run_cohort(
     with _reported(place, plan, screen) as tick:
         end = run_engine(place, engine, tick)
     summary = write_summary(place, plan, flow)
-    if not end.ok and summary.unfinished == 0:
+    if not end.ok and summary.unfinished:
+        screen.write(f"The workflow engine left cases without a result: {end.said}\n")
+    if not end.ok and not summary.unfinished:
         raise EnvironmentFault("E-COH-01", f"The workflow engine failed: {end.said}", f"Read {place.engine_log.name}.")
     return summary
 

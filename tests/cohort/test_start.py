@@ -114,8 +114,10 @@ def test_the_end_of_a_cohort(order: Order, place: CohortPlace, play: Play) -> No
 
 def test_cases_that_the_machine_kept_from_a_result(order: Order, place: CohortPlace, play: Play) -> None:
     play([refused("P1"), lost("P2"), refused("P3")], EngineEnd(ok=False, said="Batch P2 failed."))
-    summary = run_cohort(order, place, TOY_FLOW, Screen(lambda _: None, terminal=False))
+    shown: list[str] = []
+    summary = run_cohort(order, place, TOY_FLOW, Screen(shown.append, terminal=False))
     assert (summary.exit_code, summary.unfinished) == (ExitCode.ENVIRONMENT, 1)
+    assert shown[-1] == "The workflow engine left cases without a result: Batch P2 failed.\n"
 
 
 def test_an_engine_that_fails_by_itself_is_told(order: Order, place: CohortPlace, play: Play) -> None:

@@ -186,6 +186,7 @@ def test_the_doctor_finds_it_ready(patient: Path, site: Path) -> None:
     answer = sealed("doctor", "--results", "/results", options=(f"--volume={site}/results:/results",))
     assert answer.code == 0, answer.text
     assert "FAIL" not in answer.text
+    assert re.search(r"^cohorts +ok +snakemake [\d.]+ \(ct2lut-cohort\)$", answer.text, re.MULTILINE), answer.text
 
 
 def test_nothing_of_this_machine_is_in_what_the_dockerfile_adds(image: str) -> None:
