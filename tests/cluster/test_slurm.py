@@ -14,11 +14,14 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.cohort.place import CohortPlace
 from tests.cluster import slurm
 from tests.cluster.conftest import LayOut
 from tests.cluster.slurm import Cluster, cluster
 from tests.cluster.stub_cohort import BATCHES, CASES, CHECKOUT, MEMORY_MB, STUB, Behaviour, until
-from tests.cohort.phantoms import phantom_cases
+from tests.cohort.checks import problems_of
+from tests.cohort.cohort_cases import CohortCases
+from tests.cohort.real import FAST
 
 WHY_NOT = slurm.obstacle()
 pytestmark = pytest.mark.skipif(WHY_NOT is not None, reason=str(WHY_NOT))
@@ -172,25 +175,21 @@ def test_the_array_of_the_guide(
 
 
 def test_twenty_knees(site: Cluster, profile: str, tmp_path: Path) -> None:
-    """The program itself, 19 phantom knees and an empty folder; the second time nothing is left to do."""
-    cases, results = tmp_path / "cases", tmp_path / "results"
-    for case in phantom_cases(len(CASES) - 1):
-        case.write(cases)
-    (cases / "broken").mkdir()
-    command = ("cohort", "--cases", str(cases), "--results", str(results), "--protocol", "demo", "--batch-size", "4")
+    """The program itself, 18 phantom knees and two broken ones; the second time nothing is left to do."""
+    cases, results = CohortCases(20, 2), tmp_path / "results"
+    cases.write(tmp_path / "cases", processes=1)
+    places = ("--cases", str(tmp_path / "cases"), "--results", str(results))
+    settings = tuple(word for one in FAST for word in ("--set", one))
+    command = ("cohort", *places, "--protocol", "demo", "--batch-size", "4", "--profile", profile, *settings)
     before = site.jobs()
-    code, said = _ct2lut(*command, "--profile", profile)
+    code, said = _ct2lut(*command)
     assert code == REJECTED, said
     after = site.jobs()
     own = [state for job, state in after.items() if job not in before]
-    assert own
+    assert len(own) == len(list((results / "cohort.files" / "workflow" / "batches").iterdir()))
     assert set(own) == {"COMPLETED"}, said
-    with (results / "cohort.csv").open(newline="", encoding="utf-8-sig") as file:
-        words = {row["id"]: row["word"] for row in csv.DictReader(file)}
-    assert len(words) == len(CASES)
-    assert [case for case, word in words.items() if word not in {"PASS", "REVIEW"}] == ["broken"]
-    assert all((results / case / "90_package" / "lut.h5").is_file() for case in words if case != "broken")
-    assert _ct2lut(*command, "--profile", profile)[0] == REJECTED
+    assert problems_of(CohortPlace(results), cases, code) == []
+    assert _ct2lut(*command)[0] == REJECTED
     assert site.jobs() == after
 
 
