@@ -54,6 +54,12 @@ def ended_ids(place: CohortPlace) -> frozenset[str]:
     return frozenset(event.id for event in ended if event.end and not event.end.transient)
 
 
+def working_ids(place: CohortPlace) -> frozenset[str]:
+    """Cases at work, or killed while they were, by the ledgers."""
+    last = {event.id: event for path in _ledgers(place) for event in events(path.read_bytes())}
+    return frozenset(name for name, event in last.items() if event.end is None)
+
+
 def case_spans(place: CohortPlace, all_killed: Sequence[float]) -> tuple[CaseSpan, ...]:
     """Every process of a case; one that never ended lived until the next moment at which everything was killed."""
     return tuple(span for path in _ledgers(place) for span in _spans(path, all_killed))

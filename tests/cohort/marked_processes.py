@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 #: Name of the variable.
@@ -28,9 +28,13 @@ def marked(mark: str) -> Mapping[int, tuple[str, ...]]:
 
 def kill(*pids: int) -> None:
     """SIGKILL, each by its number."""
+    _send(signal.SIGKILL, *pids)
+
+
+def _send(what: signal.Signals, *pids: int) -> None:
     for pid in pids:
         with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
+            os.kill(pid, what)
 
 
 def kill_all(mark: str, patience_s: float = 30.0) -> None:
@@ -47,6 +51,19 @@ def kill_all(mark: str, patience_s: float = 30.0) -> None:
             raise TimeoutError(f"{len(left)} processes do not end")
         kill(*left)
         time.sleep(0.05)
+
+
+@contextmanager
+def standing_still(mark: str) -> Iterator[None]:
+    """Every process with this mark stands still meanwhile: what they have written does not change."""
+    stopped: set[int] = set()
+    try:
+        while fresh := marked(mark).keys() - stopped:
+            _send(signal.SIGSTOP, *fresh)
+            stopped |= fresh
+        yield
+    finally:
+        _send(signal.SIGCONT, *stopped)
 
 
 def outlived(mark: str, patience_s: float = 5.0) -> tuple[str, ...]:

@@ -16,8 +16,8 @@ from pathlib import Path
 from pipeline.cohort.place import CohortPlace
 from tests.cohort.checks import problems_of
 from tests.cohort.cohort_cases import CohortCases
-from tests.cohort.figures import CaseSpan, Span, case_spans, ended_ids, repeats
-from tests.cohort.marked_processes import VARIABLE, engines, kill, kill_all, outlived
+from tests.cohort.figures import CaseSpan, Span, case_spans, ended_ids, repeats, working_ids
+from tests.cohort.marked_processes import VARIABLE, engines, kill, kill_all, outlived, standing_still
 
 #: As for patients, with fewer attitudes, triangles and frames of the film, and with meshes judged as coarse voxels
 #: allow: all stages, a whole report and a whole package in about 20 CPU seconds.
@@ -88,6 +88,10 @@ class Order:
         return [program, "cohort", *places, "--protocol", "demo", "--jobs", "1", "--at-once", str(SLOTS), *settings]
 
 
+def _not_at_all(_: Trial, __: int) -> bool:
+    return False
+
+
 @dataclass
 class Trial:
     """A cohort on its way."""
@@ -100,16 +104,14 @@ class Trial:
     said: str = ""
     outlived: tuple[str, ...] = ()
 
-    def call(self, share: float | None = None, how: Callable[[Trial, int], None] | None = None) -> None:
-        """Type the command and wait for its end, or kill it when this share of the cases has a result."""
+    def call(self, share: float = 1.0, how: Callable[[Trial, int], bool] = _not_at_all) -> None:
+        """Type the command and wait for its end, or kill it once this share of the cases has a result."""
         begin = time.time()
         with (self.order.work / "said.txt").open("w+") as said, self._started(said.fileno()) as process:
-            while process.poll() is None and not (how and self._done() >= (share or 0.0)):
+            while process.poll() is None and not (self._done() >= share and how(self, process.pid)):
                 time.sleep(LOOK_S)
                 if time.time() > begin + self.order.limit_s:
                     raise TimeoutError(f"the command has not ended after {self.order.limit_s:.0f} s")
-            if process.poll() is None and how:
-                how(self, process.pid)
             self.code = process.wait()
             said.seek(0)
             self.said = said.read()
@@ -132,23 +134,30 @@ class Trial:
             process.wait()
 
 
-def _wrapper(_: Trial, pid: int) -> None:
+def _wrapper(_: Trial, pid: int) -> bool:
     kill(pid)
+    return True
 
 
-def _wrapper_and_engine(trial: Trial, pid: int) -> None:
+def _wrapper_and_engine(trial: Trial, pid: int) -> bool:
     found = engines(trial.mark)
     if not found:
         raise RuntimeError("the workflow engine was not found among the processes")
     kill(pid, *found)
+    return True
 
 
-def _everything(trial: Trial, _: int) -> None:
-    kill_all(trial.mark)
+def _everything(trial: Trial, _: int) -> bool:
+    """Only while a case is at work: between two of them a kill would try nothing."""
+    with standing_still(trial.mark):
+        if not working_ids(trial.order.place):
+            return False
+        kill_all(trial.mark)
     trial.all_killed.append(time.time())
+    return True
 
 
-KILLS: tuple[tuple[str, Callable[[Trial, int], None]], ...] = (
+KILLS: tuple[tuple[str, Callable[[Trial, int], bool]], ...] = (
     ("the command alone", _wrapper),
     ("the command and the engine", _wrapper_and_engine),
     ("every process", _everything),
