@@ -107,11 +107,11 @@ def watch(
     Example: ct2lut watch --cases inbox --results results --marker complete
     """
     from pipeline.cohort.case_process import CaseWork, program
-    from pipeline.cohort.inbox import Watch
     from pipeline.cohort.model import CaseLimits, CohortRequest
     from pipeline.cohort.place import CohortPlace
-    from pipeline.cohort.serving import server
-    from pipeline.cohort.watch import watch as watch_folder
+    from pipeline.cohort.watching.inbox import Watch
+    from pipeline.cohort.watching.serving import server
+    from pipeline.cohort.watching.watch import watch as watch_folder
 
     limits = CaseLimits(memory_mb, 60.0 * minutes)
     request = CohortRequest(str(cases.resolve()), _absolute(protocol), tuple(overrides or ()), jobs, limits)

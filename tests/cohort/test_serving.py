@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.cohort import serving
 from pipeline.cohort.case_process import CaseWork
 from pipeline.cohort.ledger import Ledger, events
 from pipeline.cohort.model import CaseEnd, CohortRequest, ListedCase
 from pipeline.cohort.place import CohortPlace
-from pipeline.cohort.serving import server
+from pipeline.cohort.watching import serving
+from pipeline.cohort.watching.serving import server
 from pipeline.commands.cohort_index import Places
 from pipeline.engine.stage import Stage
 from pipeline.engine.store import make_folder

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.cohort import watch as watching
-from pipeline.cohort.inbox import BACK_OFF_S, Inbox, Listing, Snapshot, Watch, list_inbox, snapshot
 from pipeline.cohort.model import CaseEnd, ListedCase
 from pipeline.cohort.place import CohortPlace
-from pipeline.cohort.watch import Pace, check_watch, watch
+from pipeline.cohort.watching import watch as watching
+from pipeline.cohort.watching.inbox import BACK_OFF_S, Inbox, Listing, Snapshot, Watch, list_inbox, snapshot
+from pipeline.cohort.watching.watch import Pace, check_watch, watch
 from pipeline.engine.lock import hold
 from pipeline.engine.store import replace_file
 from pipeline.errors import ConfigError, EnvironmentFault
@@ -275,7 +275,7 @@ def test_a_case_needs_a_file_and_the_marker_that_was_asked_for(cases: Path) -> N
 
 
 def test_too_many_files_are_left_to_the_run_to_refuse(cases: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.cohort.inbox.MAX_FILES", 3)
+    monkeypatch.setattr("pipeline.cohort.watching.inbox.MAX_FILES", 3)
     for number in range(5):
         put(cases, "P1", "data", f"{number}.dcm")
     assert snapshot(cases / "P1") == Snapshot("too many files")
@@ -445,7 +445,7 @@ def test_a_results_folder_that_cannot_be_written_to_is_waited_for(
             raise EnvironmentFault("E-ENV-02", "Writing watch.json failed: the disk is read-only (EROFS).", "Mend it.")
         replace_file(path, data)
 
-    monkeypatch.setattr("pipeline.cohort.watch.replace_file", refuse)
+    monkeypatch.setattr("pipeline.cohort.watching.watch.replace_file", refuse)
     scene.play(*[nothing] * 16)
     assert scene.said[1].startswith("waiting: E-ENV-02 Writing watch.json failed: the disk is read-only (EROFS).")
     assert scene.said[2:] == ["goes on", "P1  complete, runs now", "P1  PASS  20 s"]

@@ -12,17 +12,15 @@ from dataclasses import dataclass, field
 from pathlib import PurePath
 
 from pipeline.cohort.batch import refuse_full_disk
-from pipeline.cohort.inbox import BACK_OFF_S, Inbox, Listing, Snapshot, Watch, list_inbox
 from pipeline.cohort.model import CaseEnd, ListedCase
 from pipeline.cohort.place import CohortPlace
+from pipeline.cohort.watching.inbox import Inbox, Watch, list_inbox
 from pipeline.engine.lock import Held, hold
 from pipeline.engine.records import record_artifact
 from pipeline.engine.runlog import printable
 from pipeline.engine.storage_faults import storage
 from pipeline.engine.store import make_folder, read_file, replace_file
 from pipeline.errors import ConfigError, EnvironmentFault
-
-__all__ = ["BACK_OFF_S", "Inbox", "Listing", "Pace", "Snapshot", "Watch", "check_watch", "list_inbox", "watch"]
 
 #: Cases in a row that end in the same error: it is probably not theirs.
 _SYSTEMIC = 3
