@@ -1,6 +1,6 @@
 """A CT: what every reader of one returns, the gate of its CT numbers, and CTs in one file (NIfTI, NRRD, MetaImage).
 
-The geometry gate is that of the label maps (``volumes.check_geometry``).
+The geometry gate is that of the label maps (``geometry_gate.check_geometry``).
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from pipeline.engine.stage import Finding, Severity
 from pipeline.errors import CaseRejected
 from pipeline.files.foreign_image import ForeignImage, gunzip, gunzip_head
+from pipeline.files.geometry_gate import check_geometry, handedness
 from pipeline.files.metaimage_format import read_metaimage
 from pipeline.files.nrrd_format import read_nrrd
-from pipeline.files.volumes import check_geometry, handedness, reader_of
+from pipeline.files.volumes import reader_of
 from pipeline.geometry.volume import CtVolume, in_lps_order
 
 #: CT numbers that scanners write: below air some mark the rim of the scan, above 3071 an extended scale.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline.engine.stage import Finding, Severity
 from pipeline.errors import CaseRejected
 from pipeline.files.dicom_headers import DicomHeader
-from pipeline.files.volumes import check_geometry
+from pipeline.files.geometry_gate import check_geometry
 
 Float = NDArray[np.float64]
 

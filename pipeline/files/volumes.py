@@ -1,6 +1,6 @@
 """A label map in any accepted format to one canonical volume: LPS order, right-handed, millimetres, whole numbers.
 
-The geometry gate and the value gate stand here once, for every format.
+The value gate stands here once for every format; that of the geometry is :mod:`pipeline.files.geometry_gate`.
 """
 
 from __future__ import annotations
@@ -14,20 +14,15 @@ from numpy.typing import NDArray
 
 from pipeline.engine.stage import Finding, Severity
 from pipeline.errors import CaseRejected
-from pipeline.files.foreign_image import ForeignImage, not_finite, not_labels, unsupported
+from pipeline.files.foreign_image import ForeignImage, not_labels, unsupported
+from pipeline.files.geometry_gate import check_geometry, handedness
 from pipeline.files.metaimage_format import read_metaimage
 from pipeline.files.nrrd_format import read_nrrd
-from pipeline.geometry.volume import LabelVolume, axis_codes, in_lps_order, label_counts, shear
+from pipeline.geometry.volume import LabelVolume, in_lps_order, label_counts
 
 #: What reads the bytes of a file of some name.
 Reader = TypeVar("Reader", bound=Callable[[bytes, str], Any])
 
-#: Largest |cosine| between axes that is rounding of a header, not shear.
-MAX_SHEAR = 1e-4
-#: Voxel sizes that scanners make; outside this the unit is wrong.
-SPACING_MM = (0.1, 5.0)
-#: The smallest side may be a crop of a finger joint (20 mm), the largest a whole body (2.5 m).
-EXTENT_MM = (20.0, 2500.0)
 #: More different values than any label scheme has: it is an image.
 MAX_LABELS = 256
 #: Largest label value.
@@ -143,31 +138,6 @@ def check_belongs(label_map: LabelMap, file: str, side: str, frame_of_reference:
         )
 
 
-def check_geometry(lps_from_index: NDArray[np.float64], shape: tuple[int, ...], file: str) -> None:
-    """The gate that every volume's matrix passes.
-
-    Raises
-    ------
-    CaseRejected
-        E-GEO-03 not finite or flat, E-GEO-04 sheared, E-GEO-06 voxel size, E-GEO-07 extent.
-    """
-    if not np.isfinite(lps_from_index).all() or abs(np.linalg.det(lps_from_index[:3, :3])) < 1e-12:
-        raise not_finite(file)
-    if not (oblique := shear(lps_from_index)) <= MAX_SHEAR:
-        degrees = float(np.degrees(np.arcsin(min(oblique, 1.0))))
-        raise CaseRejected(
-            "E-GEO-04",
-            f"The axes of {file} are not at right angles: {degrees:.3g} deg off, expected below {MAX_SHEAR} rad.",
-            "Undo the gantry tilt or shear by resampling the CT before it is segmented.",
-        )
-    spacing = np.linalg.norm(lps_from_index[:3, :3], axis=0)
-    action = "Check the unit and the voxel size of the export."
-    if outside := _outside(spacing, SPACING_MM):
-        raise CaseRejected("E-GEO-06", f"The voxel size of {file} is {outside}.", action)
-    if outside := _outside(spacing * np.asarray(shape[:3]), EXTENT_MM):
-        raise CaseRejected("E-GEO-07", f"The extent of {file} is {outside}.", action)
-
-
 def label_values(values: NDArray[Any], file: str) -> tuple[NDArray[np.uint16], tuple[Finding, ...]]:
     """The voxels as uint16 labels, and a note where they came as fractions that happen to be whole.
 
@@ -203,24 +173,3 @@ def reader_of(file: str, readers: Mapping[str, Reader]) -> Reader:
         if name.endswith(ending):
             return reader
     raise unsupported(file, f"expected a file that ends in {', '.join(readers)}")
-
-
-def handedness(image: ForeignImage, file: str) -> tuple[Finding, ...]:
-    """A note where the axes of a file are left-handed."""
-    if np.linalg.det(image.lps_from_index[:3, :3]) > 0:
-        return ()
-    text = (
-        f"{file} stores its axes left-handed ({axis_codes(image.lps_from_index)}); one axis was reversed together "
-        "with its voxels, so that nothing is mirrored."
-    )
-    return (Finding("N-GEO-01", Severity.NOTE, text),)
-
-
-def _outside(actual_mm: NDArray[np.float64], limits_mm: tuple[float, float]) -> str:
-    """Empty when the three lengths are within the limits, else a description with a guess at the unit."""
-    low, high = limits_mm
-    if actual_mm.min() >= low and actual_mm.max() <= high:
-        return ""
-    guess = "metres" if actual_mm.max() < high / 500 else "micrometres" if actual_mm.min() > low * 500 else ""
-    lengths = " x ".join(f"{x:.4g}" for x in actual_mm)
-    return f"{lengths} mm, expected {low:g} to {high:g} mm" + (f" (it looks like {guess})" if guess else "")

@@ -14,7 +14,8 @@ import SimpleITK
 
 from pipeline.errors import CaseRejected
 from pipeline.files.foreign_image import Layout, check_layout
-from pipeline.files.volumes import EXTENT_MM, LabelMap, read_label_map
+from pipeline.files.geometry_gate import EXTENT_MM
+from pipeline.files.volumes import LabelMap, read_label_map
 from pipeline.geometry.volume import LabelVolume
 from tests.files.label_samples import (
     itk_bytes,
