@@ -1,7 +1,8 @@
-"""A real SLURM on this machine for as long as a test needs it: one node, loopback only, no database, no systemd.
+"""A real SLURM on this machine for as long as a test needs it: two nodes, loopback only, no database, no systemd.
 
-SLURM looks for its configuration in one place, and the workflow engine takes away the variable that names another.
-So it lies in /etc/slurm as long as the cluster stands, and goes with it.
+Each node has a name and processes of its own (namespaces of the kernel), so that a number of a process says nothing on
+the other one, and the disk of this machine. SLURM looks for its configuration in one place, and the workflow engine
+takes away the variable that names another. So it lies in /etc/slurm as long as the cluster stands, and goes with it.
 """
 
 from __future__ import annotations
@@ -19,7 +20,11 @@ from pathlib import Path
 
 #: Set by `make test-cluster`.
 WANTED = "CT2LUT_TEST_CLUSTER"
-PROGRAMS = ("slurmctld", "slurmd", "sbatch", "squeue", "sinfo", "scancel", "scontrol", "munged", "munge")
+PROGRAMS = (
+    *("slurmctld", "slurmd", "sbatch", "squeue", "sinfo", "scancel", "scontrol", "munged", "munge"),
+    *("unshare", "nsenter"),
+)
+NODES = ("node1", "node2")
 CONFIGURATION = Path("/etc/slurm/slurm.conf")
 MARK = "# test cluster of ct2lut"
 HOSTS = Path("/etc/hosts")
@@ -34,7 +39,6 @@ TEMPLATE = """{mark} of process {process} in {folder}
 ClusterName=test
 SlurmctldHost={host}(127.0.0.1)
 SlurmctldPort={controller_port}
-SlurmdPort={node_port}
 CommunicationParameters=NoCtldInAddrAny,NoInAddrAny
 SlurmUser=root
 SlurmdUser=root
@@ -56,15 +60,16 @@ ReturnToService=2
 SlurmdTimeout={node_timeout}
 KillWait=5
 StateSaveLocation={folder}/state
-SlurmdSpoolDir={folder}/spool
+SlurmdSpoolDir={folder}/%n/spool
 SlurmctldPidFile={folder}/slurmctld.pid
-SlurmdPidFile={folder}/slurmd.pid
+SlurmdPidFile={folder}/%n/slurmd.pid
 SlurmctldLogFile={folder}/slurmctld.log
-SlurmdLogFile={folder}/slurmd.log
-NodeName={host} NodeAddr=127.0.0.1 CPUs={processors} RealMemory={memory_mb} State=UNKNOWN
+SlurmdLogFile={folder}/%n/slurmd.log
+{nodes}
 PartitionName=main Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 PartitionName=knees Nodes=ALL Default=NO MaxTime=INFINITE State=UP
 """
+NODE = "NodeName={name} NodeAddr=127.0.0.1 Port={port} CPUs={processors} RealMemory={memory_mb} State=UNKNOWN"
 
 
 def obstacle() -> str | None:
@@ -87,29 +92,32 @@ class Cluster:
 
     folder: Path
 
-    def start_node(self) -> None:
-        """Start the daemon of the node and wait until the node can take a job."""
-        _say("slurmd", "-f", str(CONFIGURATION))
-        self.wait_for_node("idle", "mixed", "allocated")
+    def start_node(self, node: str) -> None:
+        """Switch a node on where it is off, start its daemon and wait until it can take a job."""
+        if not _init(self.folder / node):
+            _switch_on(self.folder / node)
+        _say(*_on(self.folder / node), "slurmd", "-f", str(CONFIGURATION))
+        self.wait_for_node(node, "idle", "mixed", "allocated")
 
-    def lose_node(self) -> None:
-        """Kill the daemon of the node and all that runs on it, as a power cut would; wait until SLURM has noticed."""
-        tree = [pid for job in _pids_of("slurmstepd") for pid in (job, *_descendants(job))]
-        self.kill_node_daemon()
-        for pid in tree:
-            _kill(pid, signal.SIGKILL)
-        self.wait_for_node("down", "down*")
+    def lose_node(self, node: str) -> None:
+        """Kill a node's daemon and all that runs on it, as a power cut would; wait until SLURM has noticed."""
+        _switch_off(self.folder / node)
+        self.wait_for_node(node, "down", "down*")
 
-    def kill_node_daemon(self) -> None:
-        """Kill the daemon of the node alone; its jobs know nothing of it."""
-        pid = int((self.folder / "slurmd.pid").read_text())
+    def kill_node_daemon(self, node: str) -> None:
+        """Kill the daemon of a node alone; its jobs know nothing of it."""
+        (pid,) = _daemons(self.folder / node)
         _kill(pid, signal.SIGKILL)
         _wait(lambda: not _alive(pid), "the daemon of the node is gone")
 
-    def wait_for_node(self, *states: str) -> None:
-        """Wait until the node is in one of some states, as ``sinfo`` calls them."""
-        asked = ("sinfo", "-h", "-o", "%T", "-p", "main")
-        _wait(lambda: _say(*asked).strip() in states, f"the node is {' or '.join(states)}", NODE_SECONDS)
+    def wait_for_node(self, node: str, *states: str) -> None:
+        """Wait until a node is in one of some states, as ``sinfo`` calls them."""
+        asked = ("sinfo", "-h", "-N", "-n", node, "-o", "%T", "-p", "main")
+        _wait(lambda: _say(*asked).strip() in states, f"{node} is {' or '.join(states)}", NODE_SECONDS)
+
+    def node(self, job: str) -> str:
+        """Where a job runs or ran last."""
+        return _say("squeue", "-h", "-t", "all", "-j", job, "-o", "%N").strip()
 
     def jobs(self) -> dict[str, str]:
         """State of every job, running and past, by its number."""
@@ -117,13 +125,14 @@ class Cluster:
         return dict(row.split() for row in rows if row)
 
     def partition(self, job: str) -> str:
-        """Where a job runs or ran."""
+        """The partition of a job."""
         return _say("squeue", "-h", "-t", "all", "-j", job, "-o", "%P").strip()
 
     def mend(self) -> None:
-        """Start the daemon of the node again where a test has left it dead."""
-        if not _alive(int((self.folder / "slurmd.pid").read_text())):
-            self.start_node()
+        """Start the daemons again that a test has left dead."""
+        for node in NODES:
+            if not _daemons(self.folder / node):
+                self.start_node(node)
 
     def memory_mb(self, job: str) -> int:
         """What a job asked for."""
@@ -153,38 +162,39 @@ class Cluster:
 
 @contextmanager
 def cluster(folder: Path) -> Iterator[Cluster]:
-    """A cluster with an idle node; all that was started or made is stopped and removed at the end, whatever happens."""
+    """A cluster with idle nodes; all that was started or made is stopped and removed at the end, whatever happens."""
     if CONFIGURATION.exists():
         _clean_left_over()
     with ExitStack() as stack:
-        stack.enter_context(_named())
+        stack.enter_context(_named(socket.gethostname(), *NODES))
         stack.enter_context(_configured(folder))
         stack.enter_context(_munge())
-        stack.callback(_stop, folder / "slurmd.pid")
+        for node in NODES:
+            stack.callback(_switch_off, folder / node)
         stack.callback(_stop, folder / "slurmctld.pid")
         _say("slurmctld", "-f", str(CONFIGURATION))
         stack.callback(_end_jobs)
         made = Cluster(folder)
-        made.start_node()
+        for node in NODES:
+            made.start_node(node)
         yield made
 
 
 @contextmanager
 def _configured(folder: Path) -> Iterator[None]:
-    for name in ("state", "spool"):
+    for name in ("state", *(f"{node}/spool" for node in NODES)):
         (folder / name).mkdir(parents=True)
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2**20
-    controller, node = _free_ports()
+    controller, *ports = _free_ports(1 + len(NODES))
+    share = {"processors": max(1, (os.cpu_count() or 1) // 2), "memory_mb": memory * 4 // 10}
     text = TEMPLATE.format(
         mark=MARK,
         process=os.getpid(),
         folder=folder,
         host=socket.gethostname(),
         controller_port=controller,
-        node_port=node,
         node_timeout=NODE_TIMEOUT_S,
-        processors=os.cpu_count(),
-        memory_mb=memory * 8 // 10,
+        nodes="\n".join(NODE.format(name=name, port=port, **share) for name, port in zip(NODES, ports, strict=True)),
     )
     with CONFIGURATION.open("x") as file:
         file.write(text)
@@ -192,6 +202,44 @@ def _configured(folder: Path) -> Iterator[None]:
         yield
     finally:
         CONFIGURATION.unlink()
+
+
+def _switch_on(folder: Path) -> None:
+    """The first process of a node; what it adopts it does not wait for, and what it started ends with it."""
+    first = f"hostname {folder.name} && exec env --ignore-signal=CHLD sleep infinity"
+    own = f"unshare --uts --pid --mount-proc --fork --kill-child sh -c '{first}'"
+    pid = _say("sh", "-c", f"setsid {own} </dev/null >{folder}/unshare.log 2>&1 & echo $!")
+    (folder / "unshare.pid").write_text(pid)
+    _wait(lambda: _name_in(_init(folder)) == "sleep", f"{folder.name} is on")
+
+
+def _switch_off(folder: Path) -> None:
+    """As by its main switch."""
+    with suppress(OSError, ValueError):
+        pid = int((folder / "unshare.pid").read_text())
+        if _name_in(pid) == "unshare":
+            inside = _descendants(pid)
+            _kill(pid, signal.SIGKILL)
+            _wait(lambda: not any(map(_alive, inside)), f"{folder.name} is off")
+
+
+def _init(folder: Path) -> int:
+    """The first process of a node, by our number; 0 where the node is off."""
+    with suppress(OSError, ValueError):
+        pid = int((folder / "unshare.pid").read_text())
+        if _name_in(pid) == "unshare":
+            return next(iter(_children(pid)), 0)
+    return 0
+
+
+def _on(folder: Path) -> tuple[str, ...]:
+    """What stands before a command to run it on a node."""
+    return ("nsenter", f"--target={_init(folder)}", "--uts", "--pid", "--mount")
+
+
+def _daemons(folder: Path) -> list[int]:
+    """The daemon of a node, by our number; none where it is dead. What it forks for a job is no child of init."""
+    return [pid for pid in _children(_init(folder)) if _name_in(pid) == "slurmd" and _alive(pid)]
 
 
 @contextmanager
@@ -212,28 +260,26 @@ def _munge() -> Iterator[None]:
 
 
 @contextmanager
-def _named() -> Iterator[None]:
-    """The name of this machine leads to an address."""
+def _named(*hosts: str) -> Iterator[None]:
+    """Names of machines lead to an address."""
+    before = HOSTS.read_text()
+    HOSTS.write_text("\n".join([before.rstrip(), *(f"127.0.0.1 {host}" for host in hosts if not _is_known(host)), ""]))
     try:
-        socket.gethostbyname(socket.gethostname())
-    except OSError:
-        before = HOSTS.read_text()
-        HOSTS.write_text(f"{before.rstrip()}\n127.0.0.1 {socket.gethostname()}\n")
-        try:
-            yield
-        finally:
-            HOSTS.write_text(before)
-    else:
         yield
+    finally:
+        HOSTS.write_text(before)
+
+
+def _is_known(host: str) -> bool:
+    with suppress(OSError):
+        return bool(socket.gethostbyname(host))
+    return False
 
 
 def _end_jobs() -> None:
     with suppress(AssertionError, subprocess.TimeoutExpired):
         _say("scancel", "--user=root")
         _wait(lambda: not _say("squeue", "-h").strip(), "no job is left")
-    for step in _pids_of("slurmstepd"):
-        for pid in (*_descendants(step), step):
-            _kill(pid, signal.SIGKILL)
 
 
 def _is_left_over() -> bool:
@@ -244,8 +290,9 @@ def _is_left_over() -> bool:
 
 def _clean_left_over() -> None:
     folder = Path(CONFIGURATION.read_text().splitlines()[0].split()[-1])
-    for name in ("slurmd.pid", "slurmctld.pid"):
-        _stop(folder / name)
+    _stop(folder / "slurmctld.pid")
+    for node in NODES:
+        _switch_off(folder / node)
     CONFIGURATION.unlink()
 
 
@@ -253,7 +300,7 @@ def _stop(pid_file: Path) -> None:
     """End a daemon by its pid file: politely, then not."""
     with suppress(OSError, ValueError):
         pid = int(pid_file.read_text())
-        if Path(f"/proc/{pid}/comm").read_text().strip() != pid_file.stem:
+        if _name_in(pid) != pid_file.stem:
             return
         _kill(pid, signal.SIGTERM)
         with suppress(AssertionError):
@@ -262,25 +309,22 @@ def _stop(pid_file: Path) -> None:
         _kill(pid, signal.SIGKILL)
 
 
-def _pids_of(name: str) -> list[int]:
-    """Processes of a program; those of SLURM are ours, as a machine has one configuration of it, and that is ours."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        with suppress(OSError):
-            if entry.name.isdigit() and (entry / "comm").read_text().strip() == name:
-                found.append(int(entry.name))
-    return found
+def _name_in(pid: int) -> str:
+    """The program of a process; nothing where there is none."""
+    with suppress(OSError):
+        return Path(f"/proc/{pid}/comm").read_text().strip()
+    return ""
 
 
 def _descendants(pid: int) -> list[int]:
+    return [found for child in _children(pid) for found in (*_descendants(child), child)]
+
+
+def _children(pid: int) -> list[int]:
     with suppress(OSError):
-        children = [int(word) for task in Path(f"/proc/{pid}/task").iterdir() for word in _children(task)]
-        return [found for child in children for found in (*_descendants(child), child)]
+        tasks = Path(f"/proc/{pid}/task").iterdir()
+        return [int(word) for task in tasks for word in (task / "children").read_text().split()]
     return []
-
-
-def _children(task: Path) -> list[str]:
-    return (task / "children").read_text().split()
 
 
 def _alive(pid: int) -> bool:
@@ -295,9 +339,10 @@ def _kill(pid: int, number: signal.Signals) -> None:
         os.kill(pid, number)
 
 
-def _free_ports() -> tuple[int, int]:
-    with socket.create_server(("127.0.0.1", 0)) as one, socket.create_server(("127.0.0.1", 0)) as other:
-        return one.getsockname()[1], other.getsockname()[1]
+def _free_ports(number: int) -> list[int]:
+    with ExitStack() as stack:
+        held = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(number)]
+        return [one.getsockname()[1] for one in held]
 
 
 def _wait(holds: Callable[[], bool], what: str, seconds: float = START_SECONDS) -> None:

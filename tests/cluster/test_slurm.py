@@ -17,7 +17,7 @@ import pytest
 from pipeline.cohort.place import CohortPlace
 from tests.cluster import slurm
 from tests.cluster.conftest import LayOut
-from tests.cluster.slurm import Cluster, cluster
+from tests.cluster.slurm import NODES, Cluster, cluster
 from tests.cluster.stub_cohort import BATCHES, CASES, CHECKOUT, MEMORY_MB, STUB, Behaviour, until
 from tests.cohort.checks import problems_of
 from tests.cohort.cohort_cases import CohortCases
@@ -40,7 +40,7 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 @pytest.fixture
 def site(machine: Cluster) -> Iterator[Cluster]:
-    """The cluster as another test found it: with its node, and no job."""
+    """The cluster as another test found it: with its nodes, and no job."""
     yield machine
     machine.mend()
     machine.forget()
@@ -68,6 +68,7 @@ def test_the_profile_as_it_is(site: Cluster, lay_out: LayOut) -> None:
     assert sorted(own.values()) == ["COMPLETED"] * len(BATCHES)
     assert {job for batch in BATCHES for _, job in cohort.attempts(batch)} == set(own)
     assert {site.partition(job) for job in own} == {"main"}
+    assert {site.node(job) for job in own} == set(NODES)
     assert not list(cohort.place.workflow.glob("slurm-*.out"))
 
 
@@ -87,29 +88,45 @@ def test_a_refusal_is_a_result_and_a_fault_of_the_machine_is_tried_again(
 
 
 def test_a_node_that_is_lost(site: Cluster, profile: str, lay_out: LayOut) -> None:
-    """SLURM itself starts its jobs again, under the same numbers; the engine only waits."""
+    """SLURM itself starts its jobs on another one, under the same numbers; the engine only waits."""
     cohort = lay_out(Behaviour(seconds=2.0))
     driver = cohort.drive(profile)
     cohort.until_some_are_done()
-    hit = cohort.running()
+    on = {batch: site.node(cohort.attempts(batch)[0][1]) for batch in cohort.running()}
+    lost = next(iter(on.values()))
     done = cohort.words()
-    site.lose_node()
+    site.lose_node(lost)
     assert len(done) <= len(cohort.words()) < len(CASES)
-    site.start_node()
     cohort.wait(driver)
     assert cohort.words() == ONCE
-    for batch in hit:
+    for batch, node in on.items():
         attempts = cohort.attempts(batch)
         assert len(set(attempts)) == 1, attempts
-        assert (len(attempts), site.starts(attempts[0][1])) == (2, 1)
+        again = int(node == lost)
+        assert (len(attempts), site.starts(attempts[0][1])) == (1 + again, again)
+        assert site.node(attempts[0][1]) != lost
+
+
+def test_all_nodes_are_lost_and_come_back(site: Cluster, profile: str, lay_out: LayOut) -> None:
+    cohort = lay_out(Behaviour(seconds=2.0))
+    driver = cohort.drive(profile)
+    cohort.until_some_are_done()
+    for node in NODES:
+        site.lose_node(node)
+    left = cohort.words()
+    assert len(left) < len(CASES)
+    site.mend()
+    cohort.wait(driver)
+    assert cohort.words() == ONCE
 
 
 def test_a_daemon_that_dies_and_comes_back_in_time_costs_nothing(site: Cluster, profile: str, lay_out: LayOut) -> None:
     cohort = lay_out(Behaviour(seconds=1.0))
     driver = cohort.drive(profile)
     cohort.until_some_are_done()
-    site.kill_node_daemon()
-    site.start_node()
+    for node in NODES:
+        site.kill_node_daemon(node)
+        site.start_node(node)
     cohort.wait(driver)
     assert cohort.words() == ONCE
     assert [len(cohort.attempts(batch)) for batch in BATCHES] == [1] * len(BATCHES)
@@ -185,9 +202,10 @@ def test_twenty_knees(site: Cluster, profile: str, tmp_path: Path) -> None:
     code, said = _ct2lut(*command)
     assert code == REJECTED, said
     after = site.jobs()
-    own = [state for job, state in after.items() if job not in before]
+    own = {job: state for job, state in after.items() if job not in before}
     assert len(own) == len(list((results / "cohort.files" / "workflow" / "batches").iterdir()))
-    assert set(own) == {"COMPLETED"}, said
+    assert set(own.values()) == {"COMPLETED"}, said
+    assert {site.node(job) for job in own} == set(NODES)
     assert problems_of(CohortPlace(results), cases, code) == []
     assert _ct2lut(*command)[0] == REJECTED
     assert site.jobs() == after
