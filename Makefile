@@ -38,6 +38,8 @@ OPTIONS = set -f; set --; for pair in $$SET; do set -- "$$@" --set "$$pair"; don
 	set -- "$$@" --cases "$$CASES" --results "$$RESULTS" --protocol "$$PROTOCOL"
 # A demonstration that ends in REVIEW (exit code 11) has worked.
 LOOK = || [ $$? -eq 11 ]
+# Tests of several files at once, one for each processor; those of one file stay together and in their order.
+TOGETHER = -n auto --maxprocesses 4 --dist loadfile
 NEED_ID = if [ -z "$$ID" ]; then echo "Which case? Type: make $@ ID=P001" >&2; exit 20; fi
 
 .DEFAULT_GOAL := help
@@ -110,7 +112,7 @@ doctor: setup  ## look whether this machine has what a run needs: make doctor [R
 	@$(BIN)/ct2lut doctor --results "$$RESULTS"
 
 test: setup-dev  ## run the tests
-	@$(BIN)/python -P -m pytest
+	@$(BIN)/python -P -m pytest $(TOGETHER)
 
 lint: setup-dev  ## check style and types
 	@$(BIN)/ruff check .
@@ -122,7 +124,7 @@ format: setup-dev  ## mend what `make lint` can mend by itself
 	@$(BIN)/ruff format .
 
 faults: setup-dev  ## run the tests of what may be wrong with a case (docs/faults.md)
-	@$(BIN)/python -P -m pytest -m fault
+	@$(BIN)/python -P -m pytest $(TOGETHER) -m fault
 
 fuzz: setup-dev  ## mutate scanner files more than a hundred times as often as the tests do; nothing may break out
 	@HOSTILE_MUTATIONS=1000 $(BIN)/python -P -m pytest tests/end_to_end/test_hostile_files.py -k "flipped or spoilt"
@@ -169,7 +171,7 @@ image:  ## build the container image ct2lut: make image [BASE=debian:bookworm-sl
 bench: setup-dev  ## measure speed
 	@$(BIN)/python -m tests.bench
 
-scale: setup-dev setup-cohort  ## a cohort of 10,000 stub cases: what engine, batches and overview cost (half an hour, 5 GB)
+scale: setup-dev setup-cohort  ## a cohort of 10,000 stub cases: what engine, batches and overview cost (10 minutes, 5 GB)
 	@$(BIN)/python -m tests.scale
 
 validate: setup-dev  ## compare with closed forms, the paper's test objects and published data
