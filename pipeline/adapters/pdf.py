@@ -11,12 +11,11 @@ import warnings
 from collections.abc import Iterator
 from typing import Any
 
+from pipeline.adapters.system_packages import TEXT, install
 from pipeline.errors import EnvironmentFault
 
 #: For long keeping, with what shows it (colour profile, fonts) inside.
 VARIANT = "pdf/a-3b"
-#: What Debian calls the system libraries, and a font with Greek letters and arrows.
-PACKAGES = "libpango-1.0-0 libpangoft2-1.0-0 libharfbuzz-subset0 fonts-dejavu-core"
 
 
 def pdf(html: str) -> bytes:
@@ -66,7 +65,7 @@ def _weasyprint() -> Any:
         raise EnvironmentFault(
             "E-ENV-12",
             "This machine cannot write report.pdf: a library that sets text (Pango, HarfBuzz) is missing, or any font.",
-            f"Install them: apt-get install -y --no-install-recommends {PACKAGES}",
+            f"Install them: {install(TEXT)}",
         ) from error
     return weasyprint
 

@@ -83,5 +83,5 @@ def _fitted(panel: Image) -> Image:
 
 def _plate() -> Image:
     plate = blank(PANEL_PX, PANEL_PX, (240, 240, 240))
-    draw_text(plate, Text("missing", 15, BOLD, GREY), (PANEL_PX / 2, PANEL_PX / 2 + 5), 0.5)
+    draw_text(plate, Text("no picture", 13, BOLD, GREY), (PANEL_PX / 2, PANEL_PX / 2 + 5), 0.5)
     return plate

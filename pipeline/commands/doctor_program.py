@@ -15,6 +15,7 @@ from importlib import metadata
 from pathlib import Path
 
 from pipeline.adapters import self_test
+from pipeline.adapters.system_packages import RENDERER, TEXT, install
 from pipeline.commands.doctor_answer import Answer, State
 from pipeline.errors import CaseRejected
 
@@ -22,14 +23,11 @@ from pipeline.errors import CaseRejected
 TRIAL_SECONDS = 120.0
 #: Of the sealed child, which does nothing.
 SEAL_SECONDS = 20.0
-#: What Debian calls the software renderer.
-RENDERER_PACKAGES = "libegl1 libgl1-mesa-dri"
 SETUP = "Install again what is missing: make setup"
 
 _DISTRIBUTION = "ct2lut"
 _TRIAL = f"import sys; from {self_test.__name__} import answer; sys.stdout.write(chr(10) + answer(sys.argv[1]))"
 _ROOT = str(Path(__file__).resolve().parents[2])
-_INSTALL_RENDERER = f"Install the software renderer: apt-get install -y --no-install-recommends {RENDERER_PACKAGES}"
 _COMPILE = "Compile it once, as the user who installed the program: ct2lut compile"
 _PLACE = "Name a folder that stays, for every run, and compile once: export NUMBA_CACHE_DIR=FOLDER; ct2lut compile"
 _SEAL = (
@@ -113,17 +111,16 @@ def renderer() -> Answer:
     """Whether pictures can be drawn without a screen, and by what."""
     told = try_in_child("renderer")
     if told.problem:
-        return Answer(f"pictures cannot be drawn: {told.problem}", State.FAIL, told.action or _INSTALL_RENDERER)
+        action = told.action or f"Install the software renderer: {install(RENDERER)}"
+        return Answer(f"pictures cannot be drawn: {told.problem}", State.FAIL, action)
     return Answer(f"{told.found} ({told.seconds:.1f} s)")
 
 
 def text() -> Answer:
     """Whether ``report.pdf`` can be written."""
-    from pipeline.adapters.pdf import PACKAGES  # noqa: PLC0415 - beside the other trials, its adapter stays unloaded
-
     told = try_in_child("text")
     if told.problem:
-        action = told.action or f"Install them: apt-get install -y --no-install-recommends {PACKAGES}"
+        action = told.action or f"Install them: {install(TEXT)}"
         return Answer(f"report.pdf cannot be written: {told.problem}", State.FAIL, action)
     return Answer(f"{told.found} ({told.seconds:.1f} s)")
 

@@ -21,7 +21,7 @@ from pipeline.geometry.knee_side import SideSign
 from pipeline.geometry.volume import axis_codes
 from pipeline.missing_surfaces import MAKEABLE, Missing
 from pipeline.records import Side
-from pipeline.suggestions import listed
+from pipeline.suggestions import listed, plain
 
 Float = NDArray[np.float64]
 
@@ -286,4 +286,4 @@ def structures_rows(structures: Iterable[str], wanted: Wanted) -> Iterator[Row]:
 
 
 def _words(names: Iterable[str]) -> str:
-    return listed(name.replace("_", " ") for name in names)
+    return listed(plain(name) for name in names)

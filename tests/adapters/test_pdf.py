@@ -17,7 +17,7 @@ from threading import Thread
 import numpy as np
 import pytest
 
-from pipeline.adapters import pdf as adapter
+from pipeline.adapters import system_packages
 from pipeline.adapters.pdf import pdf
 from pipeline.adapters.pictures import blank, png
 
@@ -159,7 +159,7 @@ def test_without_any_font_it_says_so_and_does_not_crash(tmp_path: Path) -> None:
 
 
 def test_the_same_packages_are_named_wherever_they_are_installed() -> None:
-    packages = adapter.PACKAGES.split()
+    packages = (*system_packages.RENDERER, *system_packages.TEXT)
     for name in ("tools/setup.sh", "Dockerfile"):
         text = (CHECKOUT / name).read_text()
         assert [package for package in packages if package not in text] == []

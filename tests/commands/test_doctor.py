@@ -149,8 +149,8 @@ def test_a_trial_answers_whatever_it_meets() -> None:
 
 
 def test_missing_fonts_are_told_in_the_words_of_a_run(monkeypatch: Patch) -> None:
-    monkeypatch.setattr(pdf, "_weasyprint", raising(EnvironmentFault("E-ENV-12", "no font", pdf.PACKAGES)))
-    assert trial(self_test.text) == {"problem": "no font", "action": pdf.PACKAGES}
+    monkeypatch.setattr(pdf, "_weasyprint", raising(EnvironmentFault("E-ENV-12", "no font", "install")))
+    assert trial(self_test.text) == {"problem": "no font", "action": "install"}
 
 
 def test_a_solver_that_is_not_compiled_is_worth_a_look_and_stays_so(tmp_path: Path, monkeypatch: Patch) -> None:
