@@ -26,6 +26,7 @@ from pipeline.geometry.mesh import TriangleMesh
 from pipeline.kinematics.body_frames import in_frame
 from pipeline.kinematics.joint_coordinates import JointCoordinates, reference_from_moving
 from pipeline.records import Anatomy
+from pipeline.suggestions import plain
 
 Float = NDArray[np.float64]
 
@@ -180,7 +181,7 @@ def _area_mm2(mask: SurfaceMask) -> float:
 
 
 def _findings(meshes: Collection[str], spaces: dict[str, JointSpace], taken_to_rest: tuple[str, ...]) -> Findings:
-    words = ", ".join(name.replace("_", " ") for name in meshes)
+    words = ", ".join(plain(name) for name in meshes)
     apart = " and ".join(f"{space.between_mm:.1f} mm apart {name}ly" for name, space in spaces.items())
     pose = "At a pose of rest" if taken_to_rest else "At the scan pose"
     out = [

@@ -1,4 +1,4 @@
-"""Words for messages: what a mistyped name probably meant, lists and values in a sentence."""
+"""Words for messages: what a mistyped name probably meant, names, lists and values in a sentence."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     """`` (did you mean 'x'?)`` for the known word nearest to a mistyped one; empty where none is near."""
     near = difflib.get_close_matches(word.lower(), list(known), n=1, cutoff=0.6)
     return f" (did you mean {near[0]!r}?)" if near else ""
+
+
+def plain(name: str) -> str:
+    """A name of ours in words."""
+    return name.replace("_", " ")
 
 
 def listed(words: Iterable[str]) -> str:

@@ -18,6 +18,7 @@ from pipeline.engine.stage import StrictParams
 from pipeline.errors import CaseRejected, ConfigError
 from pipeline.flow import FLOW
 from pipeline.labels.scheme import without_side
+from pipeline.missing_surfaces import MOST_ROTATION_DEG
 from tests.toy_flow import TOY_FLOW, IntakeParams, QaParams, write_toy_configs
 
 JOINTS, PROTOCOLS, PRESETS = joints(), protocols(), case_declaration.label_presets()
@@ -247,6 +248,12 @@ def test_what_comes_along_fits_the_flow(case: Path, monkeypatch: pytest.MonkeyPa
     assert list(found) == [stage.name for stage in FLOW]
     facts = found["intake"].model_dump()
     assert (facts["joint"], facts["side"]) == (joint, "left")
+
+
+def test_a_knee_is_swept_from_where_its_surfaces_are_made(case: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    (case / "case.yaml").write_text("side: left\njoint: knee")
+    assert load_settings(FLOW, case, "clinical")["sweep"].model_dump()["rest_rotation_deg"] == MOST_ROTATION_DEG
 
 
 def test_given_frames_of_a_case_replace_those_of_its_joint(case: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -158,16 +158,23 @@ def report(
 def open_page(case_id: CaseId, results: Results = DEFAULT_RESULTS) -> None:
     """Open the report of a case.
 
-    Says where it is, and shows it in a browser if this machine has one.
+    Says where it is, and shows it in a browser if this machine has one. Where the last run left no page, it opens that
+    of an earlier run and says so.
 
     Example: ct2lut open P001
     """
     from pipeline.commands.open_report import open_in_browser
-    from pipeline.commands.run_report import report_page
+    from pipeline.commands.run_report import report_page, tells_last_run
+    from pipeline.commands.summary import earlier_page_lines
+    from pipeline.engine.runner import read_status
 
-    page = report_page(results / check_case_id(case_id), shared.flow())
+    flow, folder = shared.flow(), results / check_case_id(case_id)
+    page = report_page(folder, flow)
     if page is None:
         raise ConfigError("E-OPN-01", f"{case_id} has no report yet.", f"Make it first: ct2lut report {case_id}.")
+    status = read_status(folder, flow)
+    if not tells_last_run(page, status):
+        say(*earlier_page_lines(status))
     say(f"report: {page}")
     if not open_in_browser(page):
         say("No browser here. The page needs nothing else: copy it to a computer that has one and open it there.")

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from pipeline.engine.inspection import CaseStatus
 from pipeline.engine.outcome import RunOutcome
 from pipeline.engine.stage import Stage
 from pipeline.engine.store import read_file, replace_file
@@ -47,6 +48,22 @@ def report_page(results: Path, flow: Sequence[Stage]) -> Path | None:
     """The page to open: that of the last run, else the one that a stage made."""
     page = results / PAGE
     return page if page.is_file() else _made_by_stages(results, flow)
+
+
+def tells_last_run(page: Path, status: CaseStatus) -> bool:
+    """Whether a page tells how the last run ended.
+
+    A run that is at work or was killed has written none; one that was stopped for its time or memory has its reason in
+    ``run.json`` only, and leaves the page of the run before it.
+
+    Raises
+    ------
+    EnvironmentFault
+        When the page cannot be read.
+    """
+    if status.last is None:
+        return status.state == "never"
+    return status.last.code is None or status.last.code.encode() in read_file(page)
 
 
 def _made_by_stages(results: Path, flow: Sequence[Stage]) -> Path | None:

@@ -54,6 +54,16 @@ def overview_line(case_id: str, status: CaseStatus) -> str:
     return f"{case_id:<16}  {len(done)}/{len(status.stages)} stages  {seconds:7.1f} s  {_last_run(status)}"
 
 
+def earlier_page_lines(status: CaseStatus) -> list[str]:
+    """What is said before the page of an earlier run is opened."""
+    if status.last is None:
+        what = "A run is at work" if status.state == "running" else "The last run was interrupted"
+        return [f"{what}; this is the report of an earlier run."]
+    ended = " ".join(filter(None, [status.last.word, status.last.code]))
+    reason = [text for text in (status.last.problem, status.last.action) if text]
+    return [f"The last run left no report ({ended}); this is the report of an earlier run.", *reason]
+
+
 def up_to_date(stages: int) -> str:
     """What is said when no stage had anything to do."""
     return f"nothing to do: all {stages} stages are up to date"

@@ -21,7 +21,8 @@ from pipeline.report.figures import Drawn
 from pipeline.report.motion import MOTION
 from pipeline.report.settings import PictureSettings
 from pipeline.report.sign_off import review_facts
-from pipeline.report.templates import environment, number, plain
+from pipeline.report.templates import environment, number
+from pipeline.suggestions import plain
 
 TEMPLATE = "report.html.j2"
 STYLE = "report.css"

@@ -15,7 +15,7 @@ from pipeline.report.evidence import Evidence
 from pipeline.report.figure_frame import MARGIN_PX, finished, mark_edges, title_panel
 from pipeline.report.palette import AXIS, DELTA, structure_color
 from pipeline.report.settings import PictureSettings
-from pipeline.report.templates import plain
+from pipeline.suggestions import plain
 
 Float = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from pipeline.report.figure_bones import SIDES, half_height_mm
 from pipeline.report.figure_frame import finished, mark_edges, title_panel, words_panel
 from pipeline.report.palette import BONE, MOVING, OVERLAP, scale, structure_color
 from pipeline.report.settings import PictureSettings
-from pipeline.report.templates import plain
+from pipeline.suggestions import plain
 
 Float = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from pipeline.report.evidence import Evidence
 from pipeline.report.figure_frame import finished, mark_edges, title_panel
 from pipeline.report.palette import structure_color
 from pipeline.report.settings import PictureSettings
-from pipeline.report.templates import plain
+from pipeline.suggestions import plain
 
 Float = NDArray[np.float64]
 

@@ -23,7 +23,8 @@ from pipeline.report.figure_bones import AXIS_SHARE, DELTA_SHARE, half_height_mm
 from pipeline.report.figure_frame import RESEARCH_USE, heading
 from pipeline.report.palette import AXIS, BONE, DELTA, MOVING, Color, hexadecimal, scale, structure_color
 from pipeline.report.settings import PictureSettings
-from pipeline.report.templates import plain, resource
+from pipeline.report.templates import resource
+from pipeline.suggestions import plain
 
 Float = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from pipeline.records import CrossCheck, Metric, SweepFacts
 from pipeline.report.contact_paths import excursion_mm
 from pipeline.report.evidence import Evidence
 from pipeline.report.settings import Limits
-from pipeline.report.templates import plain
+from pipeline.suggestions import plain
 
 Float = NDArray[np.float64]
 

@@ -33,7 +33,7 @@ from pipeline.report.figure_poses import body_colors, carried, structures_legend
 from pipeline.report.figures import Caption, Figure
 from pipeline.report.palette import structure_color
 from pipeline.report.settings import Limits, PictureSettings
-from pipeline.report.templates import plain
+from pipeline.suggestions import plain
 
 Float = NDArray[np.float64]
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.suggestions import plain
+
 if TYPE_CHECKING:
     from jinja2 import Environment
 
@@ -29,11 +31,6 @@ def environment() -> Environment:
 def resource(name: str) -> str:
     """Text of a file of this package: a template, a style or a script."""
     return resources.files("pipeline.report").joinpath(name).read_text(encoding="utf-8")
-
-
-def plain(name: str) -> str:
-    """A name of ours in words."""
-    return name.replace("_", " ")
 
 
 #: Nothing of a joint is known more finely; rounding errors of 1e-16 would look like results.

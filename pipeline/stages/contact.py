@@ -28,6 +28,7 @@ from pipeline.geometry.volume import LabelVolume
 from pipeline.geometry.voxel_mask import part_with, seen_as_right, voxels_of
 from pipeline.missing_surfaces import NOTHING_MADE, Made, Missing, Request, filled_in, make_surfaces
 from pipeline.records import Anatomy, CaseFacts, SurfaceOrigin
+from pipeline.suggestions import plain
 
 #: Bounds of what is made, beside the maths that keeps them.
 BOUNDS = SurfaceBounds()
@@ -224,7 +225,7 @@ def _origins(params: Params, present: list[str], made: Made) -> tuple[SurfaceOri
 
 
 def _missing_surfaces(names: tuple[str, ...], there: tuple[str, ...]) -> Findings:
-    absent = [name.replace("_", " ") for name in names if name not in there]
+    absent = [plain(name) for name in names if name not in there]
     if not absent:
         return ()
     message = f"Not labelled and therefore not part of the contact: {', '.join(absent)}."

@@ -18,6 +18,7 @@ from pipeline.geometry.mesh import TriangleMesh, check_arrays, check_closed, com
 from pipeline.geometry.volume import LabelVolume
 from pipeline.geometry.voxel_mask import part_with, seen_as_right
 from pipeline.records import MeshQuality
+from pipeline.suggestions import plain
 
 TriangleCount = Annotated[int, Field(ge=500, le=2_000_000)]
 
@@ -85,19 +86,19 @@ def run(reads: Inputs, params: Params, out: Outputs) -> Findings:
 def _checked(name: str, mesh: TriangleMesh) -> _Meshed:
     """A mesh that the case brought: closed or refused; turned where all of it is inside out."""
     try:
-        check_arrays(mesh, name)
+        check_arrays(mesh, words := plain(name))
         inverted = all(volume_mm3(piece) < 0.0 for piece in components(mesh))
         outward = flipped(mesh) if inverted else mesh
-        check_closed(outward, name)
+        check_closed(outward, words)
     except ValueError as error:
         raise CaseRejected(
             "E-MSH-02",
             f"The given mesh {error}; expected a closed surface.",
-            f"Repair the mesh of {name} (3D Slicer, MeshLab), or bring a label map instead.",
+            f"Repair the mesh of {words} (3D Slicer, MeshLab), or bring a label map instead.",
         ) from error
     volume = volume_mm3(outward)
     quality = MeshQuality(name, len(mesh.triangles), volume, volume, 0.0, 0.0, 0, 0)
-    note = _note("N-MSH-03", f"The given mesh of {name} had its normals inward; it was turned.")
+    note = _note("N-MSH-03", f"The given mesh of {words} had its normals inward; it was turned.")
     return _Meshed(outward, quality, (note,) if inverted else ())
 
 
@@ -137,13 +138,14 @@ def _left_out(name: str, error: ValueError, params: Params) -> _Meshed:
     CaseRejected
         E-MSH-01 for one that is.
     """
+    words = plain(name)
     if name in params.required:
         raise CaseRejected(
             "E-MSH-01",
-            f"The label of {name} does not give one closed surface: {error}.",
-            f"Correct the segmentation of {name} (loose parts, holes, sheets one voxel thin) and run again.",
+            f"The label of {words} does not give one closed surface: {error}.",
+            f"Correct the segmentation of {words} (loose parts, holes, sheets one voxel thin) and run again.",
         ) from error
-    message = f"The label of {name} does not give a closed surface ({error}); {name} is left out."
+    message = f"The label of {words} does not give a closed surface ({error}); {words} is left out."
     return _Meshed(None, None, (Finding("W-MSH-04", Severity.REVIEW, message),))
 
 
@@ -161,25 +163,26 @@ def _quality(name: str, result: SurfaceResult) -> MeshQuality:
 
 
 def _findings(name: str, result: SurfaceResult, volume: LabelVolume, params: Params) -> Iterator[Finding]:
+    part = plain(name)
     tolerance, error = params.volume_tolerance_fraction, result.volume_error
     if abs(error) > tolerance:
-        text = f"The mesh of {name} differs from its label by {error:+.2%} in volume, expected at most {tolerance:.2%}."
+        text = f"The mesh of {part} differs from its label by {error:+.2%} in volume, expected at most {tolerance:.2%}."
         yield Finding("W-MSH-01", Severity.REVIEW, text)
     limit = params.deviation_limit_factor * float(np.linalg.norm(volume.spacing_mm))
     if result.deviation.max_mm > limit:
-        text = f"The mesh of {name} lies up to {result.deviation.max_mm:.2f} mm off its label, expected {limit:.2f} mm."
+        text = f"The mesh of {part} lies up to {result.deviation.max_mm:.2f} mm off its label, expected {limit:.2f} mm."
         yield Finding("W-MSH-02", Severity.REVIEW, text)
     if result.deviation.worn_mm > limit:
-        text = f"Smoothing took {result.deviation.worn_mm:.2f} mm off thin parts of {name}, expected {limit:.2f} mm."
+        text = f"Smoothing took {result.deviation.worn_mm:.2f} mm off thin parts of {part}, expected {limit:.2f} mm."
         yield Finding("W-MSH-03", Severity.REVIEW, text)
     if result.pass_band != params.smoothing_pass_bands[0]:
-        text = f"{name} is thin and was smoothed less, to keep its volume (pass band {result.pass_band:g})."
+        text = f"{part} is thin and was smoothed less, to keep its volume (pass band {result.pass_band:g})."
         yield _note("N-MSH-01", text)
     if result.removed_voxels or result.filled_voxels:
-        text = f"{name}: {result.removed_voxels} loose voxels removed, {result.filled_voxels} voxels of gaps filled."
+        text = f"{part}: {result.removed_voxels} loose voxels removed, {result.filled_voxels} voxels of gaps filled."
         yield _note("N-MSH-02", text)
     if result.pieces > 1:
-        yield _note("N-MSH-04", f"{name} consists of {result.pieces} separate pieces.")
+        yield _note("N-MSH-04", f"{part} consists of {result.pieces} separate pieces.")
 
 
 def _note(code: str, message: str) -> Finding:

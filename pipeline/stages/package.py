@@ -35,6 +35,7 @@ from pipeline.files.lut_file import encode_lut
 from pipeline.files.meshes import encode_ply, encode_stl
 from pipeline.geometry.mesh import TriangleMesh
 from pipeline.records import CaseFacts, SurfaceOrigin
+from pipeline.suggestions import plain
 
 #: Findings of every stage before this one, in order; one object each, since artifacts are told apart by identity.
 _STAGES = ("intake", "segment", "mesh", "anatomy", "contact", "sweep", "smooth", "qa")
@@ -151,7 +152,7 @@ def _readme(facts: CaseFacts, origins: tuple[SurfaceOrigin, ...]) -> bytes:
 
 
 def _words(origins: tuple[SurfaceOrigin, ...], body: str) -> str:
-    names = (one.structure.replace("_", " ") for one in origins if one.body == body and one.origin != "absent")
+    names = (plain(one.structure) for one in origins if one.body == body and one.origin != "absent")
     return ", ".join(names) or f"{body} body"
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from pipeline import cli
+from pipeline.engine.outcome import RunOutcome, RunRecord, save_record
 from pipeline.errors import ExitCode
 from pipeline.files.lut_file import encode_lut
 from pipeline.playback import Lut
@@ -200,3 +201,16 @@ def test_a_display_that_shows_nothing_is_no_failure(ct2lut: Run, report: Path, m
     code, out, err = ct2lut("open", "P001")
     assert (code, err) == (ExitCode.PASS, "")
     assert out.splitlines()[1].startswith("No browser here.")
+
+
+@pytest.mark.usefixtures("report")
+def test_open_says_when_the_page_is_not_that_of_the_last_run(ct2lut: Run) -> None:
+    stopped = RunOutcome("P001", "ERROR", ExitCode.ERROR, (), "E-JOB-01", "P001 did not end within 30 min.", "Wait.")
+    save_record(Path("results/P001"), RunRecord("finished", stopped))
+    code, out, _ = ct2lut("open", "P001")
+    assert code == ExitCode.PASS
+    assert out.splitlines()[:3] == [
+        "The last run left no report (ERROR E-JOB-01); this is the report of an earlier run.",
+        "P001 did not end within 30 min.",
+        "Wait.",
+    ]

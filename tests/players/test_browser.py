@@ -248,3 +248,12 @@ def test_one_attitude_is_shown_without_a_choice(tmp_path: Path) -> None:
         assert browser.run("[...document.querySelectorAll('.viewer [type=range]')].every(one => one.disabled)") is True
         assert (pixels(browser)[..., :3] < 250).any(axis=-1).mean() > 0.05
         assert not browser.said("Runtime.exceptionThrown")
+
+
+def test_on_a_phone_nothing_but_a_wide_table_is_wider_than_the_screen(tmp_path: Path) -> None:
+    with Browser(tmp_path / "profile", *NO_WEBGL) as one:
+        one.open(written(tmp_path, evidence()), size=(390, 800))
+        assert one.run("innerWidth") == 390
+        assert one.run("document.documentElement.scrollWidth") <= 390
+        wide = "[...document.querySelectorAll('table')].some(one => one.scrollWidth > one.clientWidth)"
+        assert one.run(wide), "no table has to be scrolled: this test shows nothing"

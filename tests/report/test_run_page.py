@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.commands.run_report import report_page, write_run_page
+from pipeline.commands.run_report import report_page, tells_last_run, write_run_page
+from pipeline.commands.summary import earlier_page_lines
+from pipeline.engine.inspection import CaseStatus
 from pipeline.engine.outcome import RunOutcome, StageOutcome
 from pipeline.engine.stage import Finding, Severity, Stage
 from pipeline.errors import EnvironmentFault, ExitCode
@@ -99,3 +101,43 @@ def test_a_page_that_cannot_be_written_is_told_unless_the_run_failed_already(tmp
     with pytest.raises(EnvironmentFault, match=r"report\.html"):
         write_run_page(GOOD, tmp_path, FLOW)
     assert write_run_page(REFUSED, tmp_path, FLOW) is None
+
+
+STOPPED = RunOutcome("P1", "ERROR", ExitCode.ERROR, (), "E-JOB-01", "P1 did not end within 30 min.", "Give it more.")
+
+
+@pytest.mark.parametrize(
+    ("status", "lines"),
+    [
+        (
+            CaseStatus((), "finished", STOPPED),
+            [
+                "The last run left no report (ERROR E-JOB-01); this is the report of an earlier run.",
+                "P1 did not end within 30 min.",
+                "Give it more.",
+            ],
+        ),
+        (CaseStatus((), "interrupted", None), ["The last run was interrupted; this is the report of an earlier run."]),
+        (CaseStatus((), "running", None), ["A run is at work; this is the report of an earlier run."]),
+    ],
+)
+def test_the_page_of_an_earlier_run_is_told_as_such(tmp_path: Path, status: CaseStatus, lines: list[str]) -> None:
+    leave(tmp_path, FLOW, RUN_MARK)
+    page = write_run_page(GOOD, tmp_path, FLOW)
+    assert page is not None
+    assert tells_last_run(page, CaseStatus((), "finished", GOOD))
+    assert not tells_last_run(page, status)
+    assert earlier_page_lines(status) == lines
+
+
+def test_the_page_of_a_refusal_tells_that_run_and_no_other(tmp_path: Path) -> None:
+    page = write_run_page(REFUSED, tmp_path, FLOW)
+    assert page is not None
+    assert tells_last_run(page, CaseStatus((), "finished", REFUSED))
+    assert not tells_last_run(page, CaseStatus((), "finished", STOPPED))
+
+
+def test_a_page_without_records_is_taken_as_it_is(tmp_path: Path) -> None:
+    """A package that was copied from elsewhere has no ``run.json``."""
+    leave(tmp_path, FLOW, RUN_MARK)
+    assert tells_last_run(tmp_path / FLOW[-1].folder / "report.html", CaseStatus((), "never", None))
