@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -46,10 +47,12 @@ class ContactPath:
         return self.gap_mm <= BAND_MM
 
 
+@lru_cache(maxsize=1)
 def contact_paths(evidence: Evidence) -> tuple[ContactPath, ...]:
     """The paths of both sides at neutral varus after smoothing, at usable flexions about 5 deg apart.
 
-    A side on which the moving body has no surface that faces along delta has no path.
+    A side on which the moving body has no surface that faces along delta has no path. Found once for the
+    numbers and for the picture.
     """
     cells = _cells(evidence)
     if not cells:

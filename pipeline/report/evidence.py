@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +15,6 @@ from pipeline.kinematics.joint_coordinates import JointCoordinates, moved_from_s
 from pipeline.kinematics.neutral import NeutralCurve
 from pipeline.kinematics.table import Grid, RawTable, SmoothTable, Status
 from pipeline.records import Anatomy, CaseFacts, MeshQuality, ScanReturn, SurfaceOrigin, SweepFacts
-
-if TYPE_CHECKING:
-    from pipeline.report.contact_paths import ContactPath
 
 Float = NDArray[np.float64]
 
@@ -65,13 +60,6 @@ class Evidence:
     def scan_from_moving(self) -> Float:
         """(4, 4) kinematic frame of the moving body."""
         return np.asarray(self.anatomy.scan_from_moving, dtype=np.float64)
-
-    @cached_property
-    def contact_paths(self) -> tuple[ContactPath, ...]:
-        """Where contact wanders at neutral varus; found once, for the numbers and for the picture."""
-        from pipeline.report.contact_paths import contact_paths  # noqa: PLC0415 - it is made of this evidence
-
-        return contact_paths(self)
 
 
 @dataclass(frozen=True)

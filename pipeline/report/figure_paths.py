@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.adapters.plotting import Backdrop, Chart, ColorScale, Curve, Layout, Mark, Points, Words, charts_png
 from pipeline.adapters.rendering import Surface, snapshots
 from pipeline.geometry.views import View
-from pipeline.report.contact_paths import BAND_MM, ContactPath, SideName, excursion_mm
+from pipeline.report.contact_paths import BAND_MM, ContactPath, SideName, contact_paths, excursion_mm
 from pipeline.report.evidence import Evidence, neutral_varus
 from pipeline.report.figure_curves import FLEXION
 from pipeline.report.figure_frame import RESEARCH_USE, heading
@@ -33,7 +33,7 @@ def paths_png(evidence: Evidence) -> bytes:
     ValueError
         When no attitude at neutral varus has a contact to show.
     """
-    paths = evidence.contact_paths
+    paths = contact_paths(evidence)
     if not any(np.isfinite(path.gap_mm).any() for path in paths):
         raise ValueError("no attitude at neutral varus has a contact to show")
     varus = evidence.smooth.grid.varus_deg[neutral_varus(evidence.smooth.grid)]

@@ -16,7 +16,7 @@ from pipeline.geometry.mesh import TriangleMesh, edge_defects
 from pipeline.kinematics.interpolation import usable_entries
 from pipeline.kinematics.table import RawTable, SmoothTable, Status
 from pipeline.records import CrossCheck, Metric, SweepFacts
-from pipeline.report.contact_paths import excursion_mm
+from pipeline.report.contact_paths import contact_paths, excursion_mm
 from pipeline.report.evidence import Evidence
 from pipeline.report.settings import Limits
 from pipeline.suggestions import plain
@@ -221,7 +221,7 @@ def _smooth_metrics(evidence: Evidence, limits: Limits) -> Iterator[Metric]:
 
 
 def _path_metrics(evidence: Evidence) -> Iterator[Metric]:
-    for path in evidence.contact_paths:
+    for path in contact_paths(evidence):
         if path.touching.any():
             meaning = (
                 f"How far the middle of contact wanders forwards and backwards at neutral varus, {path.side} side."

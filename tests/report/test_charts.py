@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +23,9 @@ from pipeline.report.figures import expected_figures
 from pipeline.report.published import CHANGES, HYSTERESIS_SOURCE
 from pipeline.report.settings import Limits, PictureSettings
 from tests.report.sample import only_one_attitude, sample_evidence, with_status
+
+#: Draws the chart of an evidence with these paths.
+DrawPaths = Callable[..., None]
 
 LATERAL, ANTERIOR, PROXIMAL, ROTATION, VARUS = range(5)
 #: Flexion, varus, rotation (deg), lateral, anterior, proximal (mm) of another scan.
@@ -256,11 +259,15 @@ def test_what_is_not_known_of_a_pose_is_left_out(charts: list[Chart]) -> None:
         repeats_png(none)
 
 
-def with_paths(evidence: Evidence, *paths: ContactPath) -> Evidence:
-    """The same evidence whose paths of contact are these."""
-    copy = replace(evidence)
-    vars(copy)["contact_paths"] = paths
-    return copy
+@pytest.fixture
+def draw_paths(monkeypatch: pytest.MonkeyPatch) -> DrawPaths:
+    """Draw these paths of contact in place of those that the evidence gives."""
+
+    def draw(evidence: Evidence, *paths: ContactPath) -> None:
+        monkeypatch.setattr(figure_paths, "contact_paths", lambda _: paths)
+        paths_png(evidence)
+
+    return draw
 
 
 def path_of(gap_mm: list[float]) -> ContactPath:
@@ -269,8 +276,10 @@ def path_of(gap_mm: list[float]) -> ContactPath:
 
 
 @pytest.mark.parametrize("knee", ["right", "left"])
-def test_paths_lie_on_the_surface_as_an_observer_in_front_sees_it(knee: Side, charts: list[Chart]) -> None:
-    paths_png(with_paths(sample_evidence(knee), path_of([0.0, 0.3, 0.1])))
+def test_paths_lie_on_the_surface_as_an_observer_in_front_sees_it(
+    knee: Side, charts: list[Chart], draw_paths: DrawPaths
+) -> None:
+    draw_paths(sample_evidence(knee), path_of([0.0, 0.3, 0.1]))
     above, forwards = charts
     assert above.backdrop is not None
     left, right, bottom, top = above.backdrop.edges
@@ -292,8 +301,8 @@ def test_paths_lie_on_the_surface_as_an_observer_in_front_sees_it(knee: Side, ch
     assert rings.y.tolist() == [7.0]
 
 
-def test_a_side_that_never_touches_has_no_excursion(charts: list[Chart]) -> None:
-    paths_png(with_paths(sample_evidence(), path_of([0.3, 0.4])))
+def test_a_side_that_never_touches_has_no_excursion(charts: list[Chart], draw_paths: DrawPaths) -> None:
+    draw_paths(sample_evidence(), path_of([0.3, 0.4]))
     assert list(labelled(charts[1], "medial: touches nowhere"))
 
 
@@ -315,10 +324,10 @@ def test_the_backdrop_shows_the_body_where_it_is(charts: list[Chart]) -> None:
     assert not drawn_at(22.0, -29.0)
 
 
-def test_paths_without_contact_are_missed() -> None:
-    for nowhere in (with_paths(sample_evidence()), with_paths(sample_evidence(), path_of([np.nan, np.nan]))):
-        with pytest.raises(ValueError, match="no attitude at neutral varus has a contact to show"):
-            paths_png(nowhere)
+@pytest.mark.parametrize("paths", [(), (path_of([np.nan, np.nan]),)])
+def test_paths_without_contact_are_missed(paths: tuple[ContactPath, ...], draw_paths: DrawPaths) -> None:
+    with pytest.raises(ValueError, match="no attitude at neutral varus has a contact to show"):
+        draw_paths(sample_evidence(), *paths)
 
 
 def test_one_attitude_has_charts_too(charts: list[Chart]) -> None:

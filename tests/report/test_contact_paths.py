@@ -95,4 +95,4 @@ def test_an_excursion_counts_where_the_side_touches() -> None:
 
 def test_the_paths_are_found_once() -> None:
     evidence = balls_on_tiles()
-    assert evidence.contact_paths is evidence.contact_paths
+    assert contact_paths(evidence) is contact_paths(evidence)

@@ -194,12 +194,11 @@ def test_middles_beside_an_unusable_entry_need_no_test() -> None:
     assert untested(with_smooth(evidence, "midpoint_error_mm", np.nan, (0, 0)).smooth) == 1
 
 
-def test_paths_of_contact_inform_where_a_side_touches() -> None:
+def test_paths_of_contact_inform_where_a_side_touches(monkeypatch: pytest.MonkeyPatch) -> None:
     places, gap = np.array([4.0, -3.0]), np.array([0.0, 0.1])
     medial = ContactPath("medial", np.array([0.0, 5.0]), np.zeros(2), places, gap)
     open_ = ContactPath("lateral", np.array([0.0, 5.0]), np.zeros(2), places, gap + 1.0)
-    evidence = sample_evidence()
-    vars(evidence)["contact_paths"] = (medial, open_)
-    metrics = measured(evidence)
+    monkeypatch.setattr("pipeline.report.metrics.contact_paths", lambda _: (medial, open_))
+    metrics = measured(sample_evidence())
     assert (metrics["contact_path_medial"].value, metrics["contact_path_medial"].state) == (7.0, "info")
     assert "contact_path_lateral" not in metrics
