@@ -11,6 +11,8 @@ import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args
 
@@ -120,7 +122,7 @@ def messages_page() -> str:
     """Every code that a message can carry, with its wording; `…` stands for what differs from case to case."""
     wording: dict[str, set[str]] = defaultdict(set)
     for path in sorted((Path(__file__).parents[1] / "pipeline").rglob("*.py")):
-        for code, text in _messages(ast.parse(path.read_text())):
+        for code, text in _messages(Spelt(path).visit(ast.parse(path.read_text()))):
             wording[code].add(text or SUMMARIES.get(code, ""))
     lines = [NOTE, "", "# Messages", ""]
     lines += [
@@ -196,6 +198,20 @@ def _limits(described: FieldInfo) -> str:
     ]
     choices = [str(choice) for choice in get_args(described.annotation) if isinstance(choice, str)]
     return ", ".join(words or choices)
+
+
+@dataclass(frozen=True)
+class Spelt(ast.NodeTransformer):
+    """Puts the values of a module's constants into its texts."""
+
+    path: Path
+
+    def visit_FormattedValue(self, node: ast.FormattedValue) -> ast.expr:
+        """``{LIMIT:g}`` becomes its figure."""
+        if not (isinstance(node.value, ast.Name) and node.value.id.isupper()):
+            return node
+        module = import_module(".".join(self.path.relative_to(Path(__file__).parents[1]).with_suffix("").parts))
+        return ast.Constant(format(getattr(module, node.value.id), _template(node.format_spec or ast.Constant(""))))
 
 
 def _messages(tree: ast.Module) -> Iterator[tuple[str, str]]:

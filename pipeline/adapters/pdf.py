@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Iterator
 from typing import Any
 
-from pipeline.adapters.system_packages import TEXT, install
+from pipeline.adapters.system_packages import INSTALL_TEXT
 from pipeline.errors import EnvironmentFault
 
 #: For long keeping, with what shows it (colour profile, fonts) inside.
@@ -65,7 +65,7 @@ def _weasyprint() -> Any:
         raise EnvironmentFault(
             "E-ENV-12",
             "This machine cannot write report.pdf: a library that sets text (Pango, HarfBuzz) is missing, or any font.",
-            f"Install them: {install(TEXT)}",
+            f"Install them: {INSTALL_TEXT}",
         ) from error
     return weasyprint
 

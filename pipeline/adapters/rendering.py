@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.adapters.system_packages import RENDERER, install
+from pipeline.adapters.system_packages import INSTALL_RENDERER
 from pipeline.adapters.vtk_surface import VtkError, polydata, vtk_errors_raised
 from pipeline.errors import EnvironmentFault
 from pipeline.geometry.mesh import TriangleMesh
@@ -204,7 +204,7 @@ def require_renderer() -> None:
         raise EnvironmentFault(
             "E-ENV-10",
             f"This machine cannot draw pictures off-screen: the test of the renderer {how}.",
-            f"Install the software renderer: {install(RENDERER)}",
+            f"Install the software renderer: {INSTALL_RENDERER}",
         )
 
 

@@ -15,7 +15,7 @@ from importlib import metadata
 from pathlib import Path
 
 from pipeline.adapters import self_test
-from pipeline.adapters.system_packages import RENDERER, TEXT, install
+from pipeline.adapters.system_packages import INSTALL_RENDERER, INSTALL_TEXT
 from pipeline.commands.doctor_answer import Answer, State
 from pipeline.errors import CaseRejected
 
@@ -111,7 +111,7 @@ def renderer() -> Answer:
     """Whether pictures can be drawn without a screen, and by what."""
     told = try_in_child("renderer")
     if told.problem:
-        action = told.action or f"Install the software renderer: {install(RENDERER)}"
+        action = told.action or f"Install the software renderer: {INSTALL_RENDERER}"
         return Answer(f"pictures cannot be drawn: {told.problem}", State.FAIL, action)
     return Answer(f"{told.found} ({told.seconds:.1f} s)")
 
@@ -120,7 +120,7 @@ def text() -> Answer:
     """Whether ``report.pdf`` can be written."""
     told = try_in_child("text")
     if told.problem:
-        action = told.action or f"Install them: {install(TEXT)}"
+        action = told.action or f"Install them: {INSTALL_TEXT}"
         return Answer(f"report.pdf cannot be written: {told.problem}", State.FAIL, action)
     return Answer(f"{told.found} ({told.seconds:.1f} s)")
 

@@ -346,7 +346,7 @@ def _check_size(slices: Sequence[DicomHeader]) -> None:
     if rows * columns * len(slices) > MAX_VOXELS:
         raise CaseRejected(
             "E-IO-14",
-            f"The CT series declares {columns} x {rows} x {len(slices)} voxels, expected at most {MAX_VOXELS:.0e}.",
+            f"The CT series declares {columns} x {rows} x {len(slices)} voxels, expected at most {MAX_VOXELS:,}.",
             "Export only the part of the series that shows the joint.",
         )
     for header in slices:

@@ -142,7 +142,7 @@ def check_layout(layout: Layout, file: str) -> None:
         raise CaseRejected(
             "E-IO-14",
             f"{file} declares {_times(layout.shape)} voxels ({layout.nbytes / 1e9:.1f} GB), "
-            f"expected at most {MAX_VOXELS:.0e} voxels and {MAX_BYTES / 1e9:.0f} GB.",
+            f"expected at most {MAX_VOXELS:,} voxels and {MAX_BYTES / 1e9:.0f} GB.",
             "Crop the label map to the joint and save it with whole numbers of 8 or 16 bits.",
         )
 
