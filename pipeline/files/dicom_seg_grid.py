@@ -218,7 +218,10 @@ def _check_landing(grid: Grid, places: Places, size: tuple[int, int], file: str)
     off = np.linalg.norm(index @ grid.lps_from_index[:3, :3].T + grid.lps_from_index[:3, 3] - own, axis=2).max(axis=1)
     if not off.max() <= LANDING_MM:
         frame = int(np.argmax(off)) + 1
-        problem = f"Frame {frame} of {file} would lie {off.max():.3g} mm off its own header, expected {LANDING_MM} mm."
+        problem = (
+            f"Frame {frame} of {file} would lie {off.max():.3g} mm off its own header, "
+            f"expected at most {LANDING_MM} mm."
+        )
         raise CaseRejected("E-DCM-16", problem, _AGAIN)
 
 

@@ -370,7 +370,9 @@ def _check_landing(scan: CtVolume, stack: Stack, values: NDArray[np.int16]) -> N
         off = np.linalg.norm(corners - np.asarray(header.position), axis=1)
         nearest = int(np.argmin(off))
         if not (off[nearest] <= LANDING_MM and voxels[nearest] == values[0, 0, end]):
-            problem = f"{header.file} would lie {off[nearest]:.3g} mm off its own header, expected {LANDING_MM} mm."
+            problem = (
+                f"{header.file} would lie {off[nearest]:.3g} mm off its own header, expected at most {LANDING_MM} mm."
+            )
             raise CaseRejected("E-DCM-16", problem, _EXPORT_AGAIN)
 
 

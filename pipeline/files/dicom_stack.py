@@ -106,7 +106,9 @@ def _check_lateral(slices: Sequence[DicomHeader], heights: Float, lateral: Float
     left = np.linalg.norm(lateral - lateral.mean(axis=0) - np.outer(centred, slope), axis=1)
     if left.max() > TILT_MM:
         worst = slices[int(np.argmax(left))]
-        problem = f"{worst.file} lies {left.max():.3g} mm beside the line of the other slices, expected {TILT_MM} mm."
+        problem = (
+            f"{worst.file} lies {left.max():.3g} mm beside the line of the other slices, expected at most {TILT_MM} mm."
+        )
         raise CaseRejected("E-DCM-14", problem, _ORIGINAL)
     angle = float(np.degrees(np.arctan(np.linalg.norm(slope))))
     raise CaseRejected(

@@ -170,10 +170,12 @@ def _findings(name: str, result: SurfaceResult, volume: LabelVolume, params: Par
         yield Finding("W-MSH-01", Severity.REVIEW, text)
     limit = params.deviation_limit_factor * float(np.linalg.norm(volume.spacing_mm))
     if result.deviation.max_mm > limit:
-        text = f"The mesh of {part} lies up to {result.deviation.max_mm:.2f} mm off its label, expected {limit:.2f} mm."
+        off = result.deviation.max_mm
+        text = f"The mesh of {part} lies up to {off:.2f} mm off its label, expected at most {limit:.2f} mm."
         yield Finding("W-MSH-02", Severity.REVIEW, text)
     if result.deviation.worn_mm > limit:
-        text = f"Smoothing took {result.deviation.worn_mm:.2f} mm off thin parts of {part}, expected {limit:.2f} mm."
+        worn = result.deviation.worn_mm
+        text = f"Smoothing took {worn:.2f} mm off thin parts of {part}, expected at most {limit:.2f} mm."
         yield Finding("W-MSH-03", Severity.REVIEW, text)
     if result.pass_band != params.smoothing_pass_bands[0]:
         text = f"{part} is thin and was smoothed less, to keep its volume (pass band {result.pass_band:g})."
