@@ -189,13 +189,11 @@ WAYS: dict[str, Callable[[Case], int]] = {
 
 
 def supervise(results: Path, folder: Path, name: str) -> int:
-    """As the command line does it: a request to end is an interrupt. A case has a long time to end by itself."""
-    from pipeline.cohort import limited_process  # noqa: PLC0415
+    """As the command line does it: a request to end is an interrupt."""
     from pipeline.cohort.case_process import CaseWork, run_case  # noqa: PLC0415 - a case starts quicker without
     from pipeline.cohort.model import CohortRequest, ListedCase  # noqa: PLC0415
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    limited_process.GRACE_S = FOREVER_S
     work = CaseWork(results, CohortRequest("cases", "demo"), (sys.executable, "-S", __file__))
     try:
         run_case(ListedCase(name, folder), work)
