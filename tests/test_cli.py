@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -339,8 +340,10 @@ def test_a_signal_stops_cleanly(tmp_path: Path, number: signal.Signals) -> None:
     ) as process:
         assert process.stdout is not None
         assert "waiting\n" in iter(process.stdout.readline, "")
+        started = time.monotonic()
         process.send_signal(number)
         _, err = process.communicate(timeout=20)
+    assert time.monotonic() - started < 5
     assert process.returncode == ExitCode.INTERRUPTED
     assert err.splitlines() == ["Interrupted.", "The same command goes on where this one stopped."]
     assert not [name for name in listing(tmp_path / "results" / "P001") if "intake" in name]

@@ -206,7 +206,7 @@ def test_too_long_costs_the_case(job: CaseJob, act: Callable[[], object]) -> Non
     outcome, _ = run(job, flow_of(act, Limits(wall_s=0.3)))
     assert (outcome.word, outcome.code) == ("REJECTED", "E-IO-21")
     assert "numbers.txt could not be read safely: it took longer than" in str(outcome.problem)
-    assert time.monotonic() - start < 30
+    assert time.monotonic() - start < 5
 
 
 def test_a_fifo_that_takes_the_place_of_a_file_cannot_hold_the_run(job: CaseJob) -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,8 @@ import pytest
 
 from pipeline.engine.artifacts import SOURCE
 from pipeline.engine.outcome import CaseJob, load_record
-from pipeline.engine.stage import Findings, Inputs, Outputs, Stage
+from pipeline.engine.records import record_artifact
+from pipeline.engine.stage import Findings, Inputs, Outputs, Stage, StrictParams
 from pipeline.errors import ConfigError, EnvironmentFault, ExitCode
 from tests.engine.toy_flow import (
     FLOW,
@@ -280,6 +282,23 @@ def test_the_log_holds_one_object_a_line_also_after_a_torn_one(job: CaseJob) -> 
     good = [json.loads(line) for line in lines if not line.endswith("torn")]
     assert all(set(line) == {"ts", "id", "stage", "level", "code", "msg", "seconds"} for line in good)
     assert good[-1]["msg"] == "PASS"
+
+
+def test_a_cached_run_of_eight_stages_is_fast(job: CaseJob) -> None:
+    flow: list[Stage] = [GATHER]
+    for index in range(2, 9):
+        before, after = flow[-1].writes[0], record_artifact(f"step{index}", "step.json", tuple[int, ...])
+
+        def step(reads: Inputs, params: Any, out: Outputs, before: Any = before, after: Any = after) -> Findings:
+            out[after] = reads[before]
+            return ()
+
+        flow.append(Stage(10 * index, f"step{index}", (before,), (after,), StrictParams, step))
+    settings = {stage.name: stage.Params() for stage in flow}
+    assert states(run(job, flow, settings)[0]) == ["ran"] * 8
+    start = time.perf_counter()
+    assert states(run(job, flow, settings)[0]) == ["cached"] * 8
+    assert time.perf_counter() - start < 0.5
 
 
 def test_files_and_folders_have_their_permissions_at_any_umask(tmp_path: Path) -> None:
