@@ -18,6 +18,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.cohort.marked_processes import send
+
 #: Set by `make test-cluster`.
 WANTED = "CT2LUT_TEST_CLUSTER"
 PROGRAMS = (
@@ -107,7 +109,7 @@ class Cluster:
     def kill_node_daemon(self, node: str) -> None:
         """Kill the daemon of a node alone; its jobs know nothing of it."""
         (pid,) = _daemons(self.folder / node)
-        _kill(pid, signal.SIGKILL)
+        send(signal.SIGKILL, pid)
         _wait(lambda: not _alive(pid), "the daemon of the node is gone")
 
     def wait_for_node(self, node: str, *states: str) -> None:
@@ -219,7 +221,7 @@ def _switch_off(folder: Path) -> None:
         pid = int((folder / "unshare.pid").read_text())
         if _name_in(pid) == "unshare":
             inside = _descendants(pid)
-            _kill(pid, signal.SIGKILL)
+            send(signal.SIGKILL, pid)
             _wait(lambda: not any(map(_alive, inside)), f"{folder.name} is off")
 
 
@@ -302,11 +304,11 @@ def _stop(pid_file: Path) -> None:
         pid = int(pid_file.read_text())
         if _name_in(pid) != pid_file.stem:
             return
-        _kill(pid, signal.SIGTERM)
+        send(signal.SIGTERM, pid)
         with suppress(AssertionError):
             _wait(lambda: not _alive(pid), "it ends", seconds=10.0)
             return
-        _kill(pid, signal.SIGKILL)
+        send(signal.SIGKILL, pid)
 
 
 def _name_in(pid: int) -> str:
@@ -332,11 +334,6 @@ def _alive(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
-
-
-def _kill(pid: int, number: signal.Signals) -> None:
-    with suppress(ProcessLookupError):
-        os.kill(pid, number)
 
 
 def _free_ports(number: int) -> list[int]:

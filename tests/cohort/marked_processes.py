@@ -28,10 +28,11 @@ def marked(mark: str) -> Mapping[int, tuple[str, ...]]:
 
 def kill(*pids: int) -> None:
     """SIGKILL, each by its number."""
-    _send(signal.SIGKILL, *pids)
+    send(signal.SIGKILL, *pids)
 
 
-def _send(what: signal.Signals, *pids: int) -> None:
+def send(what: signal.Signals, *pids: int) -> None:
+    """A signal to each; one that has ended is passed over."""
     for pid in pids:
         with suppress(ProcessLookupError):
             os.kill(pid, what)
@@ -59,11 +60,11 @@ def standing_still(mark: str) -> Iterator[None]:
     stopped: set[int] = set()
     try:
         while fresh := marked(mark).keys() - stopped:
-            _send(signal.SIGSTOP, *fresh)
+            send(signal.SIGSTOP, *fresh)
             stopped |= fresh
         yield
     finally:
-        _send(signal.SIGCONT, *stopped)
+        send(signal.SIGCONT, *stopped)
 
 
 def outlived(mark: str, patience_s: float = 5.0) -> tuple[str, ...]:
